@@ -1,0 +1,258 @@
+//! Frames, tiles and the order in which tiles are rendered.
+
+use std::fmt;
+
+/// The size of a frame in pixels. Each side lies in `1..=Size::MAX_SIDE`, so that pixel
+/// coordinates fit in 16 bits and pixel counts in 32.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub struct Size {
+    width: u32,
+    height: u32,
+}
+
+/// A size that no frame can have.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+#[error("a picture is from 1x1 to {max}x{max} pixels, not {width}x{height}", max = Size::MAX_SIDE)]
+pub struct SizeError {
+    /// The width that was asked for, in pixels.
+    pub width: u64,
+    /// The height that was asked for, in pixels.
+    pub height: u64,
+}
+
+impl Size {
+    /// The longest side of a frame, in pixels.
+    pub const MAX_SIDE: u32 = 65_535;
+
+    /// Checks both sides against `1..=MAX_SIDE`.
+    pub fn new(width: u64, height: u64) -> Result<Self, SizeError> {
+        let sides = 1..=u64::from(Self::MAX_SIDE);
+        if sides.contains(&width) && sides.contains(&height) {
+            Ok(Self { width: width as u32, height: height as u32 })
+        } else {
+            Err(SizeError { width, height })
+        }
+    }
+
+    /// Pixels in a row.
+    pub fn width(self) -> u32 {
+        self.width
+    }
+
+    /// Rows.
+    pub fn height(self) -> u32 {
+        self.height
+    }
+
+    /// Pixels in the whole frame; at most 65 535², which fits.
+    pub fn pixel_count(self) -> u64 {
+        u64::from(self.width) * u64::from(self.height)
+    }
+}
+
+impl fmt::Display for Size {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}x{}", self.width, self.height)
+    }
+}
+
+/// A rectangle of pixels inside a frame: `x0..x0 + width`, `y0..y0 + height`, y downwards.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub struct Area {
+    /// The leftmost column.
+    pub x0: u32,
+    /// The topmost row.
+    pub y0: u32,
+    /// Columns, at least 1.
+    pub width: u32,
+    /// Rows, at least 1.
+    pub height: u32,
+}
+
+impl Area {
+    /// Pixels in the rectangle.
+    pub fn pixel_count(self) -> usize {
+        self.width as usize * self.height as usize
+    }
+}
+
+/// A tile of one frame, numbered row by row from the top left.
+/// Only [`TileGrid`] makes one, so it always lies inside the frame.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub struct TileId(u32);
+
+impl TileId {
+    /// The tile's number, `0..grid.count()`.
+    pub fn number(self) -> u32 {
+        self.0
+    }
+
+    /// The tile's number as an index.
+    pub fn index(self) -> usize {
+        self.0 as usize
+    }
+}
+
+/// A frame cut into squares of one side; those at the right and bottom edge may be narrower.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct TileGrid {
+    size: Size,
+    side: u32,
+}
+
+/// A tile side that cannot be used.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+#[error("a tile's side is from {low} to {high} pixels, not {0}", low = TileGrid::SIDES.start(), high = TileGrid::SIDES.end())]
+pub struct TileSideError(pub u64);
+
+impl TileGrid {
+    /// The sides that a tile may have, in pixels: below it the overhead of a tile dominates,
+    /// above it a tile no longer fits a message.
+    pub const SIDES: std::ops::RangeInclusive<u64> = 4..=1024;
+
+    /// Cuts `size` into squares of `side` pixels.
+    pub fn new(size: Size, side: u64) -> Result<Self, TileSideError> {
+        if Self::SIDES.contains(&side) {
+            Ok(Self { size, side: side as u32 })
+        } else {
+            Err(TileSideError(side))
+        }
+    }
+
+    /// Cuts `size` into tiles of the power of two from 16 to 256 that gives nearest to 1000.
+    pub fn balanced(size: Size) -> Self {
+        [16, 32, 64, 128, 256]
+            .map(|side| Self { size, side })
+            .into_iter()
+            .min_by_key(|grid| grid.count().abs_diff(1000))
+            .expect("five sides were tried")
+    }
+
+    /// The frame that is cut.
+    pub fn size(self) -> Size {
+        self.size
+    }
+
+    /// The side of a whole tile, in pixels.
+    pub fn side(self) -> u32 {
+        self.side
+    }
+
+    /// Tiles in a row.
+    pub fn columns(self) -> u32 {
+        self.size.width.div_ceil(self.side)
+    }
+
+    /// Rows of tiles.
+    pub fn rows(self) -> u32 {
+        self.size.height.div_ceil(self.side)
+    }
+
+    /// Tiles in the frame. At most 16 384² for the smallest side, which fits.
+    pub fn count(self) -> u32 {
+        self.columns() * self.rows()
+    }
+
+    /// Turns a number from the wire into a tile; `None` when the frame has no such tile.
+    pub fn tile(self, number: u32) -> Option<TileId> {
+        (number < self.count()).then_some(TileId(number))
+    }
+
+    /// The pixels of a tile.
+    pub fn area(self, tile: TileId) -> Area {
+        let (x0, y0) = (tile.0 % self.columns() * self.side, tile.0 / self.columns() * self.side);
+        Area {
+            x0,
+            y0,
+            width: self.side.min(self.size.width - x0),
+            height: self.side.min(self.size.height - y0),
+        }
+    }
+
+    /// All tiles in the order they are rendered in: square rings of 8 x 8 blocks from the middle
+    /// out, where people look first, and along a Hilbert curve inside each block, so that
+    /// neighbours in time are neighbours on the screen and share what the caches hold.
+    pub fn render_order(self) -> Vec<TileId> {
+        const BLOCK: u32 = 8;
+        let (middle_x, middle_y) = (self.columns() / 2 / BLOCK, self.rows() / 2 / BLOCK);
+        let mut keyed: Vec<((u32, u32), u32, TileId)> = (0..self.count())
+            .map(|number| {
+                let (x, y) = (number % self.columns(), number / self.columns());
+                let (block_x, block_y) = (x / BLOCK, y / BLOCK);
+                let ring = block_x.abs_diff(middle_x).max(block_y.abs_diff(middle_y));
+                let block = block_y * self.columns().div_ceil(BLOCK) + block_x;
+                ((ring, block), hilbert_index(BLOCK, x % BLOCK, y % BLOCK), TileId(number))
+            })
+            .collect();
+        keyed.sort_unstable();
+        keyed.into_iter().map(|(_, _, tile)| tile).collect()
+    }
+}
+
+/// The place of cell (x, y) along the Hilbert curve that fills a square of `side` cells, a power
+/// of two. Source: Hilbert, "Über die stetige Abbildung einer Linie auf ein Flächenstück" (1891).
+fn hilbert_index(side: u32, mut x: u32, mut y: u32) -> u32 {
+    let mut index = 0;
+    let mut half = side / 2;
+    while half > 0 {
+        let (right, below) = (u32::from(x & half > 0), u32::from(y & half > 0));
+        index += half * half * ((3 * right) ^ below);
+        if below == 0 {
+            if right == 1 {
+                (x, y) = (side - 1 - x, side - 1 - y);
+            }
+            (x, y) = (y, x);
+        }
+        half /= 2;
+    }
+    index
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn grid(width: u64, height: u64, side: u64) -> TileGrid {
+        TileGrid::new(Size::new(width, height).unwrap(), side).unwrap()
+    }
+
+    #[test]
+    fn tiles_cover_every_pixel_once() {
+        let grid = grid(101, 67, 16);
+        let mut seen = vec![0; 101 * 67];
+        for tile in grid.render_order() {
+            let area = grid.area(tile);
+            for y in area.y0..area.y0 + area.height {
+                for x in area.x0..area.x0 + area.width {
+                    seen[(y * 101 + x) as usize] += 1;
+                }
+            }
+        }
+        assert!(seen.iter().all(|&count| count == 1));
+    }
+
+    #[test]
+    fn neighbours_in_a_block_are_neighbours_on_the_screen() {
+        let grid = grid(8 * 16, 8 * 16, 16);
+        let order = grid.render_order();
+        for pair in order.windows(2) {
+            let [a, b] = [grid.area(pair[0]), grid.area(pair[1])];
+            assert_eq!(a.x0.abs_diff(b.x0) + a.y0.abs_diff(b.y0), 16, "{a:?} then {b:?}");
+        }
+    }
+
+    #[test]
+    fn the_balanced_side_gives_nearest_to_a_thousand_tiles() {
+        assert_eq!(TileGrid::balanced(Size::new(1280, 720).unwrap()).side(), 32);
+        assert_eq!(TileGrid::balanced(Size::new(16_384, 16_384).unwrap()).side(), 256);
+        assert_eq!(TileGrid::balanced(Size::new(1, 1).unwrap()).count(), 1);
+    }
+
+    #[test]
+    fn sizes_out_of_range_are_refused() {
+        for (width, height) in [(0, 1), (1, 0), (65_536, 1), (100_000, 100_000), (u64::MAX, 1)] {
+            assert_eq!(Size::new(width, height), Err(SizeError { width, height }));
+        }
+        assert_eq!(Size::new(65_535, 65_535).unwrap().pixel_count(), 4_294_836_225);
+    }
+}
