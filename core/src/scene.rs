@@ -1,10 +1,278 @@
-//! A scene as its author wrote it, checked.
+//! A scene as its author wrote it, checked: every number is finite, every reference resolves,
+//! every shape has the extent that its type promises. Only [`crate::read`] makes one from text;
+//! whoever makes one by hand keeps the invariants written at each field.
+
+use std::fmt;
+
+use glam::{DVec2, DVec3};
 
 use crate::tile::Size;
 
-/// A whole scene.
+/// A whole scene. Colours are linear red, green and blue, 1.0 where the file says 255.
 #[derive(Debug, Clone, Default)]
 pub struct Scene {
-    /// The size the file asks for, if it does.
+    /// Eye and screen; a scene without them can be checked but not rendered.
+    pub viewport: Option<Viewport>,
+    /// The size in pixels that the file asks for.
     pub size_hint: Option<Size>,
+    /// Seen where nothing is hit. Components >= 0.
+    pub background: DVec3,
+    /// Uniform light on everything; `None` where the file defines none. Components >= 0.
+    pub ambient: Option<DVec3>,
+    /// The point lights in file order.
+    pub lights: Vec<Light>,
+    /// The materials in file order, names unique.
+    pub materials: Vec<Material>,
+    /// The images that materials name.
+    pub textures: Vec<Texture>,
+    /// Spheres in file order.
+    pub spheres: Vec<Sphere>,
+    /// Triangles in file order.
+    pub triangles: Vec<Triangle>,
+    /// Texture coordinates of the triangles that have some, by ascending index in `triangles`.
+    pub triangle_texcoords: Vec<(u32, [DVec2; 3])>,
+    /// Quadrangles in file order.
+    pub quadrangles: Vec<Quadrangle>,
+    /// Texture coordinates of the quadrangles that have some, by ascending index.
+    pub quadrangle_texcoords: Vec<(u32, [DVec2; 4])>,
+    /// Parallelepipeds that stand alone, in file order.
+    pub parallelepipeds: Vec<Parallelepiped>,
+    /// Constructive solids, in file order.
+    pub solids: Vec<Solid>,
+    /// Triangle meshes, in file order.
+    pub meshes: Vec<Mesh>,
+    /// What the file held and the scene does not.
+    pub dropped: Dropped,
+}
+
+/// Faces that were left out because they cannot be seen or stand there twice.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Dropped {
+    /// Triangles of zero area.
+    pub zero_area: u64,
+    /// Exact copies of an earlier triangle: same vertices in cyclic order, material and texcoords.
+    pub duplicates: u64,
+}
+
+/// A place in a scene's text: line and column, both from 1, the column in characters.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub struct Place {
+    /// The line.
+    pub line: u32,
+    /// The column.
+    pub column: u32,
+}
+
+impl fmt::Display for Place {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}:{}", self.line, self.column)
+    }
+}
+
+/// The eye and the screen. The corners are not collinear and the eye is not in their plane.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Viewport {
+    /// Where all camera rays start.
+    pub eye: DVec3,
+    /// The outer corner of the first pixel of the first row.
+    pub top_left: DVec3,
+    /// The outer corner of the first pixel of the last row.
+    pub bottom_left: DVec3,
+    /// The outer corner of the last pixel of the first row.
+    pub top_right: DVec3,
+}
+
+impl Viewport {
+    /// The size of a picture where nobody asked for one: 1280 pixels wide, with square pixels as
+    /// nearly as whole rows allow.
+    pub fn default_size(&self) -> Size {
+        let (left, top) = (self.bottom_left - self.top_left, self.top_right - self.top_left);
+        let height = (1280.0 * (left.length() / top.length())).round();
+        Size::new(1280, height.clamp(1.0, f64::from(Size::MAX_SIDE)) as u64).expect("clamped")
+    }
+}
+
+/// A point light.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Light {
+    /// Where it is.
+    pub position: DVec3,
+    /// What a surface facing it receives at distance 1: (power / reference power) ·
+    /// reference distance² · colour. Components >= 0.
+    pub intensity: DVec3,
+}
+
+/// How a surface looks.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Material {
+    /// The name that geometry refers to.
+    pub name: String,
+    /// Surface colour, components in 0..=1.
+    pub color: DVec3,
+    /// 1 is opaque, 0 clear.
+    pub alpha: f64,
+    /// The mirrored share, 0..=1.
+    pub reflect: f64,
+    /// n1/n2 from the front side to the side behind; 0 does not bend. >= 0.
+    pub refract: f64,
+    /// The image that multiplies `color`: an index in [`Scene::textures`].
+    pub texture: Option<u32>,
+    /// Where the file sets the fields that need more than the plain tracer.
+    pub places: MaterialPlaces,
+}
+
+/// Where a material's fields stand in the file; `None` where a default holds.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct MaterialPlaces {
+    /// Of `alpha`, or of `refract` where that implies an alpha of 0.
+    pub alpha: Option<Place>,
+    /// Of `reflect`.
+    pub reflect: Option<Place>,
+    /// Of `refract`.
+    pub refract: Option<Place>,
+    /// Of `texture`.
+    pub texture: Option<Place>,
+}
+
+/// An image on a surface.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Texture {
+    /// The path as the scene has it.
+    pub path: String,
+    /// Texels in a row, at least 1.
+    pub width: u32,
+    /// Rows of texels, at least 1.
+    pub height: u32,
+    /// Red, green, blue, `[y][x]`, the top row first.
+    pub texels: Vec<[u8; 3]>,
+}
+
+/// A sphere; its front is its outside.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Sphere {
+    /// The centre.
+    pub center: DVec3,
+    /// Above 0.
+    pub radius: f64,
+    /// An index in [`Scene::materials`].
+    pub material: u32,
+    /// The place among all primitives of the file, from 0.
+    pub primitive: u32,
+}
+
+/// A triangle of an area above zero, counter-clockwise seen from its front.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Triangle {
+    /// The corners.
+    pub vertices: [DVec3; 3],
+    /// An index in [`Scene::materials`].
+    pub material: u32,
+    /// The place among all primitives of the file, from 0.
+    pub primitive: u32,
+}
+
+/// A simple quadrangle, convex or not and planar within rounding (the reader says how far),
+/// counter-clockwise seen from its front.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Quadrangle {
+    /// The corners.
+    pub vertices: [DVec3; 4],
+    /// An index in [`Scene::materials`].
+    pub material: u32,
+    /// The place among all primitives of the file, from 0.
+    pub primitive: u32,
+}
+
+/// Newell's normal of a polygon: twice its area, towards the side that sees it counter-clockwise.
+/// Source: Sutherland, Sproull & Schumacker, "A Characterization of Ten Hidden-Surface
+/// Algorithms" (1974), who credit M. E. Newell. Taken about the first vertex, so that it does not
+/// lose digits far from the origin.
+pub fn newell_normal(vertices: &[DVec3]) -> DVec3 {
+    let from_first = |k: usize| vertices[k] - vertices[0];
+    (1..vertices.len() - 1).map(|k| from_first(k).cross(from_first(k + 1))).sum()
+}
+
+/// A parallelepiped of a volume above zero; its front is its outside.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Parallelepiped {
+    /// A corner.
+    pub corner: DVec3,
+    /// From the corner to its three neighbours.
+    pub edges: [DVec3; 3],
+    /// An index in [`Scene::materials`].
+    pub material: u32,
+    /// The place among all primitives of the file, from 0.
+    pub primitive: u32,
+}
+
+/// A constructive solid: its nodes in postfix order, so that operands stand before the operation
+/// that joins them and the last node is the root.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Solid {
+    /// Postfix.
+    pub nodes: Vec<SolidNode>,
+    /// The place among all primitives of the file, from 0.
+    pub primitive: u32,
+    /// Where it begins in the file.
+    pub at: Place,
+}
+
+/// A node of a constructive solid. The `primitive` of a leaf is its place within the solid.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum SolidNode {
+    /// A leaf.
+    Sphere(Sphere),
+    /// A leaf.
+    Parallelepiped(Parallelepiped),
+    /// Joins the last `operands` (>= 2) results.
+    Operation {
+        /// How.
+        operation: Operation,
+        /// How many results it joins.
+        operands: u32,
+    },
+}
+
+/// A set operation; `Difference` is the first operand less all others.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Operation {
+    /// In any.
+    Union,
+    /// In all.
+    Intersection,
+    /// In the first and in no other.
+    Difference,
+}
+
+/// A triangle mesh from a file, with the transform that the scene asks for. The file's own
+/// numbers are kept.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Mesh {
+    /// The path as the scene has it.
+    pub path: String,
+    /// The corners that triangles share, before the transform.
+    pub vertices: MeshVertices,
+    /// Indices of corners, counter-clockwise seen from the front.
+    pub triangles: Vec<[u32; 3]>,
+    /// Applied first. Above 0.
+    pub scale: f64,
+    /// Applied second: an axis, not zero, and an angle in degrees, right-handed.
+    pub rotate: Option<(DVec3, f64)>,
+    /// Applied last.
+    pub offset: DVec3,
+    /// An index in [`Scene::materials`].
+    pub material: u32,
+    /// The place among all primitives of the file, from 0.
+    pub primitive: u32,
+    /// Where it begins in the file.
+    pub at: Place,
+}
+
+/// A mesh's corners in the precision of its file.
+#[derive(Debug, Clone, PartialEq)]
+pub enum MeshVertices {
+    /// Every coordinate fits in f32 exactly.
+    Single(Vec<[f32; 3]>),
+    /// Some do not.
+    Double(Vec<[f64; 3]>),
 }
