@@ -3,9 +3,24 @@
 //!
 //! Nothing here opens files, reads a clock, uses sockets or starts threads other than rayon's.
 
-pub mod isa;
-pub mod prepared;
-pub mod read;
-pub mod render;
 pub mod scene;
+
+pub mod read;
+
+pub mod prepared;
+
+mod bvh;
+mod node;
+mod plane;
+mod weld;
+
+pub mod isa;
+pub mod render;
+pub mod sample;
 pub mod tile;
+pub mod trace;
+
+mod quadrangle;
+mod ray;
+mod sphere;
+mod triangle;
