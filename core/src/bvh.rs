@@ -21,8 +21,9 @@ const SERIAL: usize = 4096;
 
 const BINS: usize = 16;
 
-/// What a step into a node costs, in tests of one face.
-const NODE_COST: f32 = 0.5;
+/// Parts of up to this many faces are leaves. Cutting them further makes a triangle mesh no faster
+/// to trace and takes half as many bytes again.
+const LEAF: usize = 4;
 
 /// An axis-aligned box.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -73,8 +74,6 @@ struct Part<'a> {
     bounds: Bounds,
     /// The bounds of twice the middles.
     middles: Bounds,
-    /// Found not worth cutting.
-    is_leaf: bool,
 }
 
 /// Builds the hierarchy over `leaflets` and brings them into the order in which leaves name them.
@@ -103,37 +102,22 @@ impl<'a> Part<'a> {
         } else {
             measure(leaflets)
         };
-        Self { leaflets, first, bounds, middles, is_leaf: false }
+        Self { leaflets, first, bounds, middles }
     }
 
-    /// Whether to cut, and where.
-    fn plan(&self, level: usize) -> Plan {
-        let count = self.leaflets.len();
+    /// Cuts in two where it is cheapest.
+    fn cut(self, level: usize) -> [Self; 2] {
         let cut = if level < MEDIAN_LEVEL { self.cheapest_cut() } else { None };
-        let area = self.bounds.half_area();
-        let pays =
-            cut.as_ref().is_some_and(|cut| NODE_COST * area + cut.cost < area * count as f32);
-        match cut {
-            _ if count == 1 || (count <= 4 && !pays) => Plan::Leaf,
-            Some(cut) => Plan::Cut(cut),
-            None => Plan::Halve,
-        }
-    }
-
-    /// Cuts as planned; gives the part back as a leaf when cutting does not pay.
-    fn cut(mut self, level: usize) -> Result<[Self; 2], Self> {
-        let count = self.leaflets.len();
-        let at = match self.plan(level) {
-            Plan::Leaf => {
-                self.is_leaf = true;
-                return Err(self);
-            }
-            Plan::Cut(cut) => cut.partition(self.leaflets),
-            Plan::Halve => count / 2, // Nothing tells them apart.
+        let at = match cut {
+            Some(cut) => cut.partition(self.leaflets),
+            None => self.leaflets.len() / 2, // Nothing tells them apart.
         };
         let (left, right) = self.leaflets.split_at_mut(at);
-        let right_first = self.first + at;
-        Ok([Part::new(left, self.first), Part::new(right, right_first)])
+        [Part::new(left, self.first), Part::new(right, self.first + at)]
+    }
+
+    fn is_leaf(&self) -> bool {
+        self.leaflets.len() <= LEAF
     }
 
     /// The cut between two bins with the least area x count on its sides; `None` where the
@@ -173,12 +157,6 @@ impl<'a> Part<'a> {
         }
         best
     }
-}
-
-enum Plan {
-    Leaf,
-    Cut(Cut),
-    Halve,
 }
 
 #[derive(Clone, Copy)]
@@ -257,16 +235,11 @@ fn build_node(part: Part<'_>, level: usize) -> Vec<Node> {
     let mut parts = vec![part];
     while parts.len() < 8 {
         let widest = (0..parts.len())
-            .filter(|&k| !parts[k].is_leaf)
+            .filter(|&k| !parts[k].is_leaf())
             .max_by(|&a, &b| parts[a].bounds.half_area().total_cmp(&parts[b].bounds.half_area()));
         let Some(widest) = widest else { break };
-        match parts.swap_remove(widest).cut(level) {
-            Ok(halves) => parts.extend(halves),
-            Err(leaf) => parts.push(leaf),
-        }
-    }
-    for part in parts.iter_mut().filter(|part| part.leaflets.len() <= 4) {
-        part.is_leaf |= matches!(part.plan(level + 1), Plan::Leaf);
+        let halves = parts.swap_remove(widest).cut(level);
+        parts.extend(halves);
     }
     parts.sort_by_key(|part| part.first);
     let mut node = Node::EMPTY;
@@ -278,7 +251,7 @@ fn build_node(part: Part<'_>, level: usize) -> Vec<Node> {
     }
     let total: usize = parts.iter().map(|part| part.leaflets.len()).sum();
     let build = |part: Part<'_>| {
-        if part.is_leaf {
+        if part.is_leaf() {
             Err(Child::leaf(part.first, part.leaflets.len()))
         } else {
             Ok(build_node(part, level + 1))
