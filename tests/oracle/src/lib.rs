@@ -1,1 +1,33 @@
-//! To come.
+//! Brute-force truth that tests hold the tracer to: every face is asked about every ray, each
+//! decision is made exactly, and nothing is shared with the tracer but the scene's types.
+
+#![expect(clippy::float_cmp, reason = "truth is compared exactly")]
+
+// Numbers that are exact, or know how far off they are; times along a ray.
+mod dyadic;
+mod number;
+mod root;
+mod vector;
+
+// Faces and what a ray meets.
+mod ball;
+mod face;
+mod margin;
+mod oracle;
+mod polygon;
+mod ray;
+
+// What is seen.
+mod light;
+mod picture;
+mod radiance;
+
+// What tests throw at the oracle and at the tracer.
+pub mod random;
+pub mod random_scene;
+
+pub use face::{FaceId, Leaving};
+pub use light::Passage;
+pub use oracle::{Hit, Oracle};
+pub use picture::{Positions, eye_direction, grid_positions, reference_picture};
+pub use radiance::Settings;
