@@ -74,7 +74,13 @@ fn gnome(scene: &mut String, x: f64) {
     for side in [-1.0, 1.0] {
         for k in 0..6 {
             let t = f64::from(k) / 5.0;
-            ball(side * (0.27 + 0.05 * t), 0.15 - 0.02 * t, 0.05 + 0.34 * t, 0.17 - 0.02 * t, "boot");
+            ball(
+                side * (0.27 + 0.05 * t),
+                0.15 - 0.02 * t,
+                0.05 + 0.34 * t,
+                0.17 - 0.02 * t,
+                "boot",
+            );
             ball(side * (0.24 - 0.03 * t), 0.28 + 0.22 * t, 0.04, 0.17 + 0.03 * t, "trousers");
         }
         // The left arm hangs, the right one holds the bottle's shoulder.
@@ -93,8 +99,20 @@ fn gnome(scene: &mut String, x: f64) {
         ball(side * 0.4, 1.74, 0.0, 0.09, "skin");
         for k in 0..7 {
             let t = f64::from(k) / 6.0;
-            ball(side * (0.04 + 0.25 * t), 1.6 - 0.06 * t * t, 0.43 - 0.1 * t, 0.075 - 0.045 * t, "beard");
-            ball(side * (0.08 + 0.13 * t), 1.93 + 0.03 * (1.0 - t), 0.345 - 0.02 * t, 0.035, "beard");
+            ball(
+                side * (0.04 + 0.25 * t),
+                1.6 - 0.06 * t * t,
+                0.43 - 0.1 * t,
+                0.075 - 0.045 * t,
+                "beard",
+            );
+            ball(
+                side * (0.08 + 0.13 * t),
+                1.93 + 0.03 * (1.0 - t),
+                0.345 - 0.02 * t,
+                0.035,
+                "beard",
+            );
         }
     }
     ball(0.0, 0.72, 0.0, 0.53, "coat");
@@ -180,7 +198,8 @@ fn bottle(scene: &mut String, x: f64, z: f64) {
             };
             let [a, b, c, d] = [point(i, j), point(i + 1, j), point(i + 1, j + 1), point(i, j + 1)];
             for corners in [[a, b, c], [a, c, d]] {
-                if corners[0] == corners[1] || corners[1] == corners[2] || corners[2] == corners[0] {
+                if corners[0] == corners[1] || corners[1] == corners[2] || corners[2] == corners[0]
+                {
                     continue; // At the axis.
                 }
                 let [p, q, r] = corners.map(|(x, y, z)| format!("vertex {x:.4} {y:.4} {z:.4}"));

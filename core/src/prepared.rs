@@ -14,6 +14,7 @@ use crate::{
     plane,
     ray::{Item, Kind, Surface},
     scene::{self, Material, Place, Scene},
+    triangle::triangle_normal,
     weld::weld,
 };
 
@@ -560,7 +561,7 @@ impl<'a> Faces<'a> {
             let plane = self.plane_of(first);
             let index = self.shared.len() as u32;
             for &(_, _, face) in group {
-                let normal = scene::newell_normal(self.corners(face as usize));
+                let normal = plane::unit_normal(self.corners(face as usize));
                 let reversed = normal.dot(DVec3::from_array(plane.normal)) < 0.0;
                 planes[face as usize] =
                     FacePlane::Shared(PlaneIndex(index | u32::from(reversed) << 31));
@@ -583,10 +584,7 @@ impl<'a> Faces<'a> {
         let corners = self.corners(face);
         let from_first: DVec3 = corners.iter().map(|&corner| corner - corners[0]).sum();
         let mean = corners[0] + from_first / corners.len() as f64;
-        PlaneRecord {
-            point: mean.to_array(),
-            normal: unit(scene::newell_normal(corners)).to_array(),
-        }
+        PlaneRecord { point: mean.to_array(), normal: plane::unit_normal(corners).to_array() }
     }
 
     fn frame(&self) -> Frame {
@@ -731,7 +729,7 @@ impl Sorted {
         };
         for triangle in &self.triangles {
             let corners = triangle.vertices.map(|v| DVec3::from_array(self.vertices[v as usize]));
-            let normal = unit(scene::newell_normal(&corners));
+            let normal = triangle_normal(corners);
             add_flat(&triangle.vertices, normal, Surface(triangle.rank));
         }
         for face in &self.coplanars {
@@ -753,12 +751,6 @@ impl Sorted {
         surfaces.dedup();
         surfaces
     }
-}
-
-/// The direction of a vector that is not zero, also where its square underflows.
-fn unit(v: DVec3) -> DVec3 {
-    let v = v * power_of_two_below_inverse(v.abs().max_element());
-    v / v.length()
 }
 
 /// A prepared scene whose every index, bound and number has been checked.

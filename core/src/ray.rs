@@ -163,12 +163,11 @@ pub(crate) fn edge(a: &Projected, b: &Projected) -> f64 {
     a.x * b.y - a.y * b.x
 }
 
-/// [`edge`] with the digits that the products lost: 0 only where the exact value is.
-#[cold]
+/// [`edge`] with the digits that the products lost: right to an ulp or two.
 pub(crate) fn exact_edge(a: &Projected, b: &Projected) -> f64 {
     let (left, left_error) = exact_product(a.x, b.y);
     let (right, right_error) = exact_product(a.y, b.x);
-    if left == right { left_error - right_error } else { left - right }
+    (left - right) + (left_error - right_error)
 }
 
 /// The side on which a ray passes that is nudged off every edge: by ε² along x and by the much
@@ -179,14 +178,19 @@ pub(crate) fn exact_edge(a: &Projected, b: &Projected) -> f64 {
 /// Source: Edelsbrunner & Mücke, "Simulation of Simplicity" (1990).
 #[cold]
 pub(crate) fn side(a: &Projected, b: &Projected) -> i32 {
-    let sign = |value: f64| i32::from(value > 0.0) - i32::from(value < 0.0);
-    [exact_edge(a, b), b.x - a.x, a.y - b.y].into_iter().map(sign).find(|&s| s != 0).unwrap_or(0)
+    let (left, left_error) = exact_product(a.x, b.y);
+    let (right, right_error) = exact_product(a.y, b.x);
+    // Equal products differ by what they lost; after that the nudge decides.
+    [left - right, left_error - right_error, b.x - a.x, a.y - b.y]
+        .into_iter()
+        .find(|&difference| difference != 0.0)
+        .map_or(0, |difference| if difference > 0.0 { 1 } else { -1 })
 }
 
 /// a · b as the rounded product and what rounding took away, exact while neither overflows nor
 /// underflows. Source: Dekker, "A floating-point technique for extending the available precision"
 /// (1971), with Veltkamp's splitting.
-fn exact_product(a: f64, b: f64) -> (f64, f64) {
+pub(crate) fn exact_product(a: f64, b: f64) -> (f64, f64) {
     let product = a * b;
     let (a_high, a_low) = split(a);
     let (b_high, b_low) = split(b);

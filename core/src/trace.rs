@@ -209,11 +209,11 @@ fn meet(view: &View<'_>, ray: &Ray, shear: &Shear, item: Item) -> Option<(f64, u
                 return None;
             }
             let corners = view.corners(&face.vertices).map(|corner| shear.project(corner));
-            hit_triangle(corners)?;
+            let t = hit_triangle(corners)?;
             // The plane's distance, not this triangle's: coincident faces are met at one place.
             let plane = &view.planes[face.plane.index()];
             let [point, normal] = [plane.point, plane.normal].map(DVec3::from_array);
-            (hit_plane(ray, point, normal)?, face.rank)
+            (hit_plane(ray, point, normal).unwrap_or(t), face.rank)
         }
         Kind::Quadrangle => {
             let face = &view.quadrangles[index];

@@ -15,26 +15,32 @@ use crate::{
 /// so a needle that is grazed is never met outside itself.
 #[inline(always)]
 pub(crate) fn hit_triangle([a, b, c]: [Projected; 3]) -> Option<f64> {
-    let (mut over_a, mut over_b, mut over_c) = (edge(&b, &c), edge(&c, &a), edge(&a, &b));
-    if (over_a < 0.0 || over_b < 0.0 || over_c < 0.0)
-        && (over_a > 0.0 || over_b > 0.0 || over_c > 0.0)
-    {
+    let mut over = [edge(&b, &c), edge(&c, &a), edge(&a, &b)];
+    if over.iter().any(|&w| w < 0.0) && over.iter().any(|&w| w > 0.0) {
         return None;
     }
-    if over_a == 0.0 || over_b == 0.0 || over_c == 0.0 {
+    if over.contains(&0.0) {
         let sides = [side(&b, &c), side(&c, &a), side(&a, &b)];
         if sides[0] == 0 || sides[0] != sides[1] || sides[1] != sides[2] {
             return None;
         }
-        (over_a, over_b, over_c) = (exact_edge(&b, &c), exact_edge(&c, &a), exact_edge(&a, &b));
     }
-    let area = over_a + over_b + over_c;
+    // In a needle, and in any triangle seen edge-on, products cancel: without their lost digits
+    // the distance would be that of some other point of the triangle.
+    let extent = [a, b, c].iter().map(|p| p.x.abs().max(p.y.abs())).fold(0.0, f64::max);
+    if (over[0] + over[1] + over[2]).abs() <= extent * extent / 8.0 {
+        over = [exact_edge(&b, &c), exact_edge(&c, &a), exact_edge(&a, &b)];
+    }
+    let area = over[0] + over[1] + over[2];
     if area == 0.0 {
         return None; // Smaller than numbers go.
     }
-    let t = (over_a * a.z + over_b * b.z + over_c * c.z) / area;
+    let t = (over[0] * a.z + over[1] * b.z + over[2] * c.z) / area;
     Some(t.max(a.z.min(b.z).min(c.z)).min(a.z.max(b.z).max(c.z)))
 }
+
+/// The sine of the angle between a ray and a face below which the face is as good as seen edge-on.
+pub(crate) const EDGE_ON: f64 = 1.0 / 1_048_576.0;
 
 /// The unit normal towards the side that sees the corners counter-clockwise. Edges are first
 /// scaled by a power of two, so that no triangle is too small for its area to be a number.
