@@ -3,9 +3,17 @@
 //!
 //! Nothing here opens files, reads a clock, uses sockets or starts threads other than rayon's.
 
+mod block;
+mod diagnostic;
+mod exact;
 pub mod isa;
+mod lexer;
+pub mod mesh_file;
 pub mod prepared;
 pub mod read;
 pub mod render;
 pub mod scene;
+mod symbol;
+pub mod texture;
 pub mod tile;
+mod triangles;
