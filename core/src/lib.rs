@@ -5,22 +5,31 @@
 
 pub mod scene;
 
+// Text into a scene.
+mod block;
+mod diagnostic;
+mod exact;
+mod lexer;
+pub mod mesh_file;
 pub mod read;
+mod symbol;
+pub mod texture;
+mod triangles;
 
-pub mod prepared;
-
+// A scene into a prepared scene.
 mod bvh;
 mod node;
 mod plane;
+pub mod prepared;
 mod weld;
 
+// A prepared scene into tiles.
 pub mod isa;
-pub mod render;
-pub mod sample;
-pub mod tile;
-pub mod trace;
-
 mod quadrangle;
 mod ray;
+pub mod render;
+pub mod sample;
 mod sphere;
+pub mod tile;
+pub mod trace;
 mod triangle;

@@ -15,7 +15,7 @@ use rtfarm_oracle::{
 
 /// Where the true answer changes within this distance (in units of the greatest coordinate that
 /// takes part) either answer is right: a few roundings of f64.
-const CLOSE: f64 = 64.0 * f64::EPSILON;
+const CLOSE: f64 = 256.0 * f64::EPSILON;
 
 /// A quadrangle's corners are in one plane only within rounding. The oracle looks at it along its
 /// normal, the tracer along the ray: for one that is grazed that makes a difference.
