@@ -4,6 +4,7 @@
 //! Nothing here opens files, reads a clock, uses sockets or starts threads other than rayon's.
 
 pub mod isa;
+pub mod picture;
 pub mod prepared;
 pub mod read;
 pub mod render;
