@@ -118,14 +118,7 @@ impl Picture {
     pub fn put(&self, area: Area, pixels: &[[f32; 3]]) -> Result<(), PutError> {
         assert!(area.x0 + area.width <= self.size.width(), "the area is inside the picture");
         assert!(area.y0 + area.height <= self.size.height(), "the area is inside the picture");
-        if pixels.len() != area.pixel_count() {
-            return Err(PutError::PixelCount { expected: area.pixel_count(), found: pixels.len() });
-        }
-        if let Some(index) = pixels.iter().position(|pixel| pixel.iter().any(|c| c.is_nan())) {
-            let index = index as u32;
-            let (x, y) = (area.x0 + index % area.width, area.y0 + index / area.width);
-            return Err(PutError::NotANumber { x, y });
-        }
+        check_pixels(area, pixels)?;
         let mut bytes = Vec::with_capacity(area.width as usize * self.format.bytes_per_pixel());
         for (y, row) in (area.y0..).zip(pixels.chunks_exact(area.width as usize)) {
             bytes.clear();
@@ -226,6 +219,21 @@ impl Picture {
     fn offset(&self, x: u32, y: u32) -> u64 {
         let pixels = u64::from(y) * u64::from(self.size.width()) + u64::from(x);
         pixels * self.format.bytes_per_pixel() as u64
+    }
+}
+
+/// Says why [`Picture::put`] would refuse `pixels`, whatever the state of its file.
+pub fn check_pixels(area: Area, pixels: &[[f32; 3]]) -> Result<(), PutError> {
+    if pixels.len() != area.pixel_count() {
+        return Err(PutError::PixelCount { expected: area.pixel_count(), found: pixels.len() });
+    }
+    match pixels.iter().position(|pixel| pixel.iter().any(|channel| channel.is_nan())) {
+        Some(index) => {
+            let index = index as u32;
+            let (x, y) = (area.x0 + index % area.width, area.y0 + index / area.width);
+            Err(PutError::NotANumber { x, y })
+        }
+        None => Ok(()),
     }
 }
 
