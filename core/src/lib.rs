@@ -25,6 +25,7 @@ mod weld;
 
 // A prepared scene into tiles.
 pub mod isa;
+pub mod picture;
 mod quadrangle;
 mod ray;
 pub mod render;

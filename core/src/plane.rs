@@ -49,16 +49,6 @@ pub(crate) fn plane_prints(
     prints
 }
 
-/// Whether two sets of corners lie in one plane, exactly (but for one chance in 2^61).
-pub(crate) fn is_flat(corners: &[DVec3; 4]) -> bool {
-    let [a, b, c, d] = *corners;
-    let mut prints = [[a, b, c], [a, c, d], [a, b, d], [b, c, d]]
-        .into_iter()
-        .filter_map(|corners| plane_prints(1, |_| corners)[0]);
-    let first = prints.next();
-    prints.all(|print| Some(print) == first)
-}
-
 /// Newell's normal of a polygon, of length 1, each component right to a few ulp of 1 however thin
 /// the polygon is: differences and products keep what rounding would take.
 ///

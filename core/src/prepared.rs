@@ -10,6 +10,7 @@ use glam::DVec3;
 
 use crate::{
     bvh::{self, Bounds, Leaflet},
+    exact::is_coplanar,
     node::{self, Child, Frame, Node},
     plane,
     ray::{Item, Kind, Surface},
@@ -545,8 +546,9 @@ impl<'a> Faces<'a> {
         let mut by_plane: Vec<(u64, u32, u32)> = prints
             .into_iter()
             .enumerate()
-            .filter(|&(face, _)| {
-                face < triangles || plane::is_flat(self.corners(face).try_into().expect("four"))
+            .filter(|&(face, _)| match *self.corners(face) {
+                [a, b, c, d] => is_coplanar(a, b, c, d),
+                _ => true,
             })
             .filter_map(|(face, print)| Some((print?, self.rank(face), face as u32)))
             .collect();
