@@ -16,6 +16,7 @@ mod margin;
 mod oracle;
 mod polygon;
 mod ray;
+mod solid;
 
 // What is seen.
 mod light;

@@ -10,6 +10,7 @@ use crate::{
     face::{Crossing, Face, FaceId, Leaving, Shape},
     polygon::Polygon,
     ray::Ray,
+    solid::SolidFaces,
     vector::Vector,
 };
 
@@ -17,7 +18,9 @@ use crate::{
 #[derive(Debug)]
 pub struct Oracle {
     pub(crate) scene: Scene,
+    /// Those of the solids last.
     pub(crate) faces: Vec<Face>,
+    solids: Vec<SolidFaces>,
     index_of: HashMap<FaceId, usize>,
 }
 
@@ -69,8 +72,11 @@ impl Oracle {
         for solid in &scene.parallelepipeds {
             faces.extend(parallelepiped_faces(solid, solid.primitive, 0));
         }
+        let solids: Vec<_> =
+            scene.solids.iter().map(|solid| SolidFaces::new(solid, &mut faces)).collect();
         let index_of = faces.iter().enumerate().map(|(k, face)| (face.id, k)).collect();
-        Self { scene: scene.clone(), faces, index_of }
+        assert!(scene.meshes.is_empty(), "the oracle takes a mesh as triangles");
+        Self { scene: scene.clone(), faces, solids, index_of }
     }
 
     /// The first face that a ray crosses: the smallest (t, primitive, face) with t > 0.
@@ -110,10 +116,10 @@ impl Oracle {
         leaving: Option<Leaving>,
     ) -> impl Iterator<Item = Crossing<'_>> {
         let left = self.left(leaving);
-        self.faces
-            .iter()
-            .flat_map(move |face| face.cross(ray, left))
-            .filter(move |crossing| crossing.is_ahead(ray, leaving))
+        let plain_count = self.solids.first().map_or(self.faces.len(), |solid| solid.faces.start);
+        let plain = self.faces[..plain_count].iter().flat_map(move |face| face.cross(ray, left));
+        let solids = self.solids.iter().flat_map(move |solid| solid.cross(&self.faces, ray, left));
+        plain.chain(solids).filter(move |crossing| crossing.is_ahead(ray, leaving))
     }
 
     /// The face that a ray leaves.
@@ -143,7 +149,7 @@ fn exact_corners(corners: &[DVec3]) -> Vec<Vector<crate::dyadic::Dyadic>> {
 }
 
 /// The six faces, numbered from `first` as [`FaceId::face`] says.
-fn parallelepiped_faces(
+pub(crate) fn parallelepiped_faces(
     solid: &Parallelepiped,
     primitive: u32,
     first: u32,

@@ -101,10 +101,18 @@ impl Polygon {
         self.corners.iter().map(BothVector::to_dvec3).collect()
     }
 
-    /// Whether the ray's line meets the line of an edge.
-    pub(crate) fn meets_edge(&self, ray: &Ray) -> bool {
-        let count = self.corners.len();
-        (0..count).any(|k| self.volume::<Dyadic>(ray, k, (k + 1) % count).sign().is_eq())
+    /// The distance between the ray's line and the line of the edge from corner k to the next;
+    /// infinite if they are parallel.
+    pub(crate) fn distance_to_edge(&self, ray: &Ray, k: usize) -> f64 {
+        let next = (k + 1) % self.corners.len();
+        let edge = self.corners[next].exact.minus(&self.corners[k].exact);
+        let across = ray.direction.exact.cross(&edge);
+        let squared = across.dot(&across);
+        if squared.sign().is_eq() {
+            return f64::INFINITY;
+        }
+        let volume = self.volume::<Dyadic>(ray, k, next);
+        volume.divided_by(&squared.square_root()).to_f64().abs()
     }
 
     /// t as numerator and denominator: n·(anchor - o) and n·d.
