@@ -23,6 +23,9 @@ mod light;
 mod picture;
 mod radiance;
 
+// What needs no rays.
+pub mod closed_forms;
+
 // What tests throw at the oracle and at the tracer.
 pub mod random;
 pub mod random_scene;
