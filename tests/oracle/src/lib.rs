@@ -13,6 +13,7 @@ mod vector;
 mod ball;
 mod face;
 mod margin;
+mod mesh;
 mod oracle;
 mod polygon;
 mod ray;
@@ -32,6 +33,7 @@ pub mod random_scene;
 
 pub use face::{FaceId, Leaving};
 pub use light::Passage;
+pub use mesh::mesh_triangles;
 pub use oracle::{Hit, Oracle};
 pub use picture::{Positions, eye_direction, grid_positions, reference_picture};
 pub use radiance::Settings;

@@ -7,7 +7,9 @@ use rtfarm_core::scene::{Parallelepiped, Scene};
 
 use crate::{
     ball::Ball,
+    dyadic::Dyadic,
     face::{Crossing, Face, FaceId, Leaving, Shape},
+    mesh::mesh_triangles,
     polygon::Polygon,
     ray::Ray,
     solid::SolidFaces,
@@ -72,10 +74,22 @@ impl Oracle {
         for solid in &scene.parallelepipeds {
             faces.extend(parallelepiped_faces(solid, solid.primitive, 0));
         }
+        for mesh in &scene.meshes {
+            for (index, corners) in (0..).zip(mesh_triangles(mesh)) {
+                let corners = exact_corners(&corners);
+                // Rounding may have made it a line, which no ray crosses.
+                if Polygon::has_area(&corners) {
+                    faces.push(Face {
+                        shape: Shape::Polygon(Polygon::planar(corners)),
+                        id: FaceId { primitive: mesh.primitive, face: index },
+                        material: mesh.material,
+                    });
+                }
+            }
+        }
         let solids: Vec<_> =
             scene.solids.iter().map(|solid| SolidFaces::new(solid, &mut faces)).collect();
         let index_of = faces.iter().enumerate().map(|(k, face)| (face.id, k)).collect();
-        assert!(scene.meshes.is_empty(), "the oracle takes a mesh as triangles");
         Self { scene: scene.clone(), faces, solids, index_of }
     }
 
@@ -144,7 +158,7 @@ pub(crate) fn hit(ray: &Ray, crossing: &Crossing<'_>) -> Hit {
     }
 }
 
-fn exact_corners(corners: &[DVec3]) -> Vec<Vector<crate::dyadic::Dyadic>> {
+fn exact_corners(corners: &[DVec3]) -> Vec<Vector<Dyadic>> {
     corners.iter().map(|&corner| Vector::exactly(corner)).collect()
 }
 

@@ -38,12 +38,14 @@ impl Polygon {
         Self::new(corners, sum, count)
     }
 
+    /// Whether the corners do not all lie in a line.
+    pub(crate) fn has_area(corners: &[Vector<Dyadic>]) -> bool {
+        newell_normal(corners).0.iter().any(|part| part.sign().is_ne())
+    }
+
     fn new(corners: Vec<Vector<Dyadic>>, anchor_sum: Vector<Dyadic>, anchor_count: f64) -> Self {
-        let from_first = |k: usize| corners[k].minus(&corners[0]);
-        let mut normal = from_first(1).cross(&from_first(2));
-        for k in 2..corners.len() - 1 {
-            normal = normal.plus(&from_first(k).cross(&from_first(k + 1)));
-        }
+        assert!(Self::has_area(&corners), "a face needs an area");
+        let normal = newell_normal(&corners);
         Self {
             corners: corners.into_iter().map(BothVector::from).collect(),
             unit_normal: normal.normalized().to_dvec3(),
@@ -169,4 +171,13 @@ impl Polygon {
         let from_origin = |k: usize| self.corners[k].of::<N>().minus(ray.origin.of());
         ray.direction.of().dot(&from_origin(i).cross(&from_origin(j)))
     }
+}
+
+/// Newell's normal: twice the area long, towards the side that sees the corners counter-clockwise.
+fn newell_normal(corners: &[Vector<Dyadic>]) -> Vector<Dyadic> {
+    let from_first = |k: usize| corners[k].minus(&corners[0]);
+    let first = from_first(1).cross(&from_first(2));
+    (2..corners.len() - 1)
+        .map(|k| from_first(k).cross(&from_first(k + 1)))
+        .fold(first, |sum, part| sum.plus(&part))
 }

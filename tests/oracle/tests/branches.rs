@@ -5,7 +5,12 @@ use rtfarm_core::scene::{
     Light, Material, MaterialPlaces, Operation, Parallelepiped, Place, Quadrangle, Scene, Solid,
     SolidNode, Sphere, Triangle,
 };
-use rtfarm_oracle::{Oracle, Settings};
+use rtfarm_core::tile::Size;
+use rtfarm_oracle::{
+    Oracle, Settings, grid_positions,
+    random_scene::{Recipe, Style, random_scene},
+    reference_picture,
+};
 
 const O: DVec3 = DVec3::ZERO;
 const SKY: DVec3 = DVec3::new(0.5, 0.25, 1.0);
@@ -210,4 +215,19 @@ fn lights_are_seen_through_mirrors() {
     scene.quadrangles = vec![square(0., 0, 0), square(1., 1, 1)];
     // Straight down: the mirror's own light at distance 1/2, and half that of the ceiling.
     check_seen(&scene, v(0., 0., 0.25), -DVec3::Z, DVec3::splat(0.5 * 4.0 + 0.5 * 4.0));
+}
+
+#[test]
+fn pictures_of_random_scenes_are_finite_and_not_negative() {
+    for style in [Style::Plain, Style::Grid, Style::Extreme, Style::Far] {
+        for seed in 0..8 {
+            let recipe = Recipe { solids: 2, clear: true, ..Recipe::new(style) };
+            let scene = random_scene(seed, &recipe);
+            let size = Size::new(12, 12).unwrap();
+            let settings = Settings { cutoff: 1.0 / 64.0, ..Settings::default() };
+            let picture = reference_picture(&scene, size, &|_, _| grid_positions(1), &settings);
+            assert_eq!(picture.len(), 144);
+            assert!(picture.iter().flatten().all(|&value| value.is_finite() && value >= 0.0));
+        }
+    }
 }
