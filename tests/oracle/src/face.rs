@@ -135,6 +135,14 @@ impl Face {
         }
     }
 
+    /// The same, near enough for an estimate.
+    pub(crate) fn rough_normal(&self, point: DVec3) -> DVec3 {
+        match &self.shape {
+            Shape::Ball(ball) => (point - ball.sphere.center).normalize_or_zero(),
+            Shape::Polygon(polygon) => polygon.unit_normal(),
+        }
+    }
+
     fn crossing(&self, time: Approx, place: Place, front: bool) -> Crossing<'_> {
         Crossing { face: self, time, place, front, reversed: false }
     }

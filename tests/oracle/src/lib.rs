@@ -13,14 +13,19 @@ mod vector;
 mod ball;
 mod face;
 mod margin;
+mod mesh;
 mod oracle;
 mod polygon;
 mod ray;
+mod solid;
 
 // What is seen.
 mod light;
 mod picture;
 mod radiance;
+
+// What needs no rays.
+pub mod closed_forms;
 
 // What tests throw at the oracle and at the tracer.
 pub mod random;
@@ -28,6 +33,7 @@ pub mod random_scene;
 
 pub use face::{FaceId, Leaving};
 pub use light::Passage;
+pub use mesh::mesh_triangles;
 pub use oracle::{Hit, Oracle};
 pub use picture::{Positions, eye_direction, grid_positions, reference_picture};
 pub use radiance::Settings;

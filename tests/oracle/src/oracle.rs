@@ -7,9 +7,12 @@ use rtfarm_core::scene::{Parallelepiped, Scene};
 
 use crate::{
     ball::Ball,
+    dyadic::Dyadic,
     face::{Crossing, Face, FaceId, Leaving, Shape},
+    mesh::mesh_triangles,
     polygon::Polygon,
     ray::Ray,
+    solid::SolidFaces,
     vector::Vector,
 };
 
@@ -17,7 +20,9 @@ use crate::{
 #[derive(Debug)]
 pub struct Oracle {
     pub(crate) scene: Scene,
+    /// Those of the solids last.
     pub(crate) faces: Vec<Face>,
+    solids: Vec<SolidFaces>,
     index_of: HashMap<FaceId, usize>,
 }
 
@@ -69,8 +74,23 @@ impl Oracle {
         for solid in &scene.parallelepipeds {
             faces.extend(parallelepiped_faces(solid, solid.primitive, 0));
         }
+        for mesh in &scene.meshes {
+            for (index, corners) in (0..).zip(mesh_triangles(mesh)) {
+                let corners = exact_corners(&corners);
+                // Rounding may have made it a line, which no ray crosses.
+                if Polygon::has_area(&corners) {
+                    faces.push(Face {
+                        shape: Shape::Polygon(Polygon::planar(corners)),
+                        id: FaceId { primitive: mesh.primitive, face: index },
+                        material: mesh.material,
+                    });
+                }
+            }
+        }
+        let solids: Vec<_> =
+            scene.solids.iter().map(|solid| SolidFaces::new(solid, &mut faces)).collect();
         let index_of = faces.iter().enumerate().map(|(k, face)| (face.id, k)).collect();
-        Self { scene: scene.clone(), faces, index_of }
+        Self { scene: scene.clone(), faces, solids, index_of }
     }
 
     /// The first face that a ray crosses: the smallest (t, primitive, face) with t > 0.
@@ -110,10 +130,10 @@ impl Oracle {
         leaving: Option<Leaving>,
     ) -> impl Iterator<Item = Crossing<'_>> {
         let left = self.left(leaving);
-        self.faces
-            .iter()
-            .flat_map(move |face| face.cross(ray, left))
-            .filter(move |crossing| crossing.is_ahead(ray, leaving))
+        let plain_count = self.solids.first().map_or(self.faces.len(), |solid| solid.faces.start);
+        let plain = self.faces[..plain_count].iter().flat_map(move |face| face.cross(ray, left));
+        let solids = self.solids.iter().flat_map(move |solid| solid.cross(&self.faces, ray, left));
+        plain.chain(solids).filter(move |crossing| crossing.is_ahead(ray, leaving))
     }
 
     /// The face that a ray leaves.
@@ -138,12 +158,12 @@ pub(crate) fn hit(ray: &Ray, crossing: &Crossing<'_>) -> Hit {
     }
 }
 
-fn exact_corners(corners: &[DVec3]) -> Vec<Vector<crate::dyadic::Dyadic>> {
+fn exact_corners(corners: &[DVec3]) -> Vec<Vector<Dyadic>> {
     corners.iter().map(|&corner| Vector::exactly(corner)).collect()
 }
 
 /// The six faces, numbered from `first` as [`FaceId::face`] says.
-fn parallelepiped_faces(
+pub(crate) fn parallelepiped_faces(
     solid: &Parallelepiped,
     primitive: u32,
     first: u32,

@@ -38,12 +38,14 @@ impl Polygon {
         Self::new(corners, sum, count)
     }
 
+    /// Whether the corners do not all lie in a line.
+    pub(crate) fn has_area(corners: &[Vector<Dyadic>]) -> bool {
+        newell_normal(corners).0.iter().any(|part| part.sign().is_ne())
+    }
+
     fn new(corners: Vec<Vector<Dyadic>>, anchor_sum: Vector<Dyadic>, anchor_count: f64) -> Self {
-        let from_first = |k: usize| corners[k].minus(&corners[0]);
-        let mut normal = from_first(1).cross(&from_first(2));
-        for k in 2..corners.len() - 1 {
-            normal = normal.plus(&from_first(k).cross(&from_first(k + 1)));
-        }
+        assert!(Self::has_area(&corners), "a face needs an area");
+        let normal = newell_normal(&corners);
         Self {
             corners: corners.into_iter().map(BothVector::from).collect(),
             unit_normal: normal.normalized().to_dvec3(),
@@ -101,10 +103,18 @@ impl Polygon {
         self.corners.iter().map(BothVector::to_dvec3).collect()
     }
 
-    /// Whether the ray's line meets the line of an edge.
-    pub(crate) fn meets_edge(&self, ray: &Ray) -> bool {
-        let count = self.corners.len();
-        (0..count).any(|k| self.volume::<Dyadic>(ray, k, (k + 1) % count).sign().is_eq())
+    /// The distance between the ray's line and the line of the edge from corner k to the next;
+    /// infinite if they are parallel.
+    pub(crate) fn distance_to_edge(&self, ray: &Ray, k: usize) -> f64 {
+        let next = (k + 1) % self.corners.len();
+        let edge = self.corners[next].exact.minus(&self.corners[k].exact);
+        let across = ray.direction.exact.cross(&edge);
+        let squared = across.dot(&across);
+        if squared.sign().is_eq() {
+            return f64::INFINITY;
+        }
+        let volume = self.volume::<Dyadic>(ray, k, next);
+        volume.divided_by(&squared.square_root()).to_f64().abs()
     }
 
     /// t as numerator and denominator: n·(anchor - o) and n·d.
@@ -161,4 +171,13 @@ impl Polygon {
         let from_origin = |k: usize| self.corners[k].of::<N>().minus(ray.origin.of());
         ray.direction.of().dot(&from_origin(i).cross(&from_origin(j)))
     }
+}
+
+/// Newell's normal: twice the area long, towards the side that sees the corners counter-clockwise.
+fn newell_normal(corners: &[Vector<Dyadic>]) -> Vector<Dyadic> {
+    let from_first = |k: usize| corners[k].minus(&corners[0]);
+    let first = from_first(1).cross(&from_first(2));
+    (2..corners.len() - 1)
+        .map(|k| from_first(k).cross(&from_first(k + 1)))
+        .fold(first, |sum, part| sum.plus(&part))
 }

@@ -209,14 +209,14 @@ impl Maker {
 
     /// A tree of two to six leaves whose operations join two or three operands.
     fn solid(&mut self) -> Solid {
-        let primitive = self.primitive();
+        let (primitive, center) = (self.primitive(), self.place());
         let mut nodes = Vec::new();
         let (mut leaves, mut ready) = (0, 0);
         while ready < 2 || leaves < 6 && self.random.chance(0.6) {
             if ready >= 2 && self.random.chance(0.4) {
                 ready -= self.join(&mut nodes, ready) - 1;
             } else {
-                nodes.push(self.leaf(leaves));
+                nodes.push(self.leaf(leaves, center));
                 (leaves, ready) = (leaves + 1, ready + 1);
             }
         }
@@ -226,12 +226,21 @@ impl Maker {
         Solid { nodes, primitive, at: Place { line: 1, column: 1 } }
     }
 
-    fn leaf(&mut self, index: u32) -> SolidNode {
-        if self.random.chance(0.5) {
-            SolidNode::Sphere(Sphere { primitive: index, ..self.sphere() })
+    /// A leaf whose middle is near `center`, so that leaves overlap.
+    fn leaf(&mut self, index: u32, center: DVec3) -> SolidNode {
+        let nudge = self.random.in_cube() * 0.5;
+        let center = center + if self.style == Style::Grid { snap(nudge) } else { nudge };
+        // Leaves have numbers of their own.
+        let primitives = self.primitives;
+        let leaf = if self.random.chance(0.5) {
+            SolidNode::Sphere(Sphere { center, primitive: index, ..self.sphere() })
         } else {
-            SolidNode::Parallelepiped(Parallelepiped { primitive: index, ..self.parallelepiped() })
-        }
+            let solid = self.parallelepiped();
+            let corner = center - solid.edges.iter().sum::<DVec3>() / 2.0;
+            SolidNode::Parallelepiped(Parallelepiped { corner, primitive: index, ..solid })
+        };
+        self.primitives = primitives;
+        leaf
     }
 
     /// Adds an operation and tells how many of the `ready` results it takes.

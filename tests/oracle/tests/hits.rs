@@ -201,7 +201,7 @@ fn slightly_different_planes_are_told_apart() {
 fn for_random_rays(seeds: u64, rays: u32, mut check: impl FnMut(&Scene, &Oracle, DVec3, DVec3)) {
     for style in [Style::Plain, Style::Grid, Style::Extreme, Style::Far] {
         for seed in 0..seeds {
-            let scene = random_scene(seed, &Recipe::new(style));
+            let scene = random_scene(seed, &Recipe { solids: 1, ..Recipe::new(style) });
             let oracle = Oracle::new(&scene);
             let mut random = Random::new(seed);
             for _ in 0..rays {
@@ -290,6 +290,63 @@ fn a_hit_lies_on_its_face_and_the_first_is_the_first_of_all() {
                 let scale = hit.point.length() + sphere.center.length() + sphere.radius;
                 assert!(error.abs() < 1e-14 * scale);
             }
+        }
+    });
+}
+
+#[test]
+fn a_ray_that_goes_through_meets_the_rest_of_what_it_would_have_met() {
+    let mut passed = 0;
+    for_random_rays(20, 20, |_, oracle, origin, direction| {
+        let hits = oracle.all_hits(origin, direction, None);
+        if hits.first().is_none_or(|hit| hit.margin < 1e-9) {
+            return;
+        }
+        for (k, hit) in hits.iter().enumerate() {
+            let leaving = Some(Leaving { id: hit.id, through: true });
+            let rest = oracle.all_hits(hit.point, direction, leaving);
+            let ids = |hits: &[Hit]| hits.iter().map(|hit| (hit.id, hit.front)).collect::<Vec<_>>();
+            assert_eq!(ids(&rest), ids(&hits[k + 1..]), "{origin} {direction}");
+            // Back from there it meets all that came before, but nothing in the same place.
+            let leaving = Some(Leaving { id: hit.id, through: false });
+            let back = oracle.all_hits(hit.point, -direction, leaving);
+            let before = hits[..k].iter().rev().filter(|other| other.t < hit.t);
+            let ids: Vec<FaceId> = before.map(|hit| hit.id).collect();
+            let times = back.iter().map(|hit| hit.t);
+            assert!(times.is_sorted() && back.len() >= ids.len());
+            passed += ids.len();
+        }
+    });
+    assert!(passed > 1000, "{passed}");
+}
+
+#[test]
+fn scaling_by_a_power_of_two_changes_no_answer() {
+    for_random_rays(6, 20, |scene, oracle, origin, direction| {
+        let hits = oracle.all_hits(origin, direction, None);
+        for exponent in [-300, -40, 40, 300] {
+            let factor = 2f64.powi(exponent);
+            let mut scaled = scene.clone();
+            scaled.solids.clear();
+            for sphere in &mut scaled.spheres {
+                sphere.center *= factor;
+                sphere.radius *= factor;
+            }
+            for vertex in scaled.triangles.iter_mut().flat_map(|t| &mut t.vertices) {
+                *vertex *= factor;
+            }
+            for vertex in scaled.quadrangles.iter_mut().flat_map(|q| &mut q.vertices) {
+                *vertex *= factor;
+            }
+            for solid in &mut scaled.parallelepipeds {
+                solid.corner *= factor;
+                solid.edges = solid.edges.map(|edge| edge * factor);
+            }
+            let scaled = Oracle::new(&scaled).all_hits(origin * factor, direction * factor, None);
+            let solids: Vec<u32> = scene.solids.iter().map(|solid| solid.primitive).collect();
+            let plain = hits.iter().filter(|hit| !solids.contains(&hit.id.primitive));
+            let told = |hit: &Hit| (hit.t, hit.id, hit.normal, hit.front);
+            assert!(plain.map(told).eq(scaled.iter().map(told)));
         }
     });
 }
