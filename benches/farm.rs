@@ -14,7 +14,7 @@ use tokio::time::Instant;
 
 /// Spheres on a grid: enough work for every pixel, nothing to read but this file.
 fn scene_text() -> String {
-    let mut text = "\
+    let head = "\
 viewport
 origin 0 0 -20
 topleft -8 4.5 -10
@@ -38,13 +38,13 @@ power 1
 endpoint
 endlights
 geometry
-"
-    .to_owned();
-    for number in 0..400 {
+";
+    let sphere = |number: u32| {
         let (x, y) = (f64::from(number % 25) - 12.0, f64::from(number / 25) - 7.5);
-        text += &format!("sphere\ncoords {x} {y} 0\nradius 0.45\nmaterial grey\nendsphere\n");
-    }
-    text + "endgeometry\n"
+        format!("sphere\ncoords {x} {y} 0\nradius 0.45\nmaterial grey\nendsphere\n")
+    };
+    let spheres: Vec<String> = (0..400).map(sphere).collect();
+    [head, &spheres.concat(), "endgeometry\n"].concat()
 }
 
 fn main() -> anyhow::Result<()> {
