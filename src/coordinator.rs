@@ -27,7 +27,8 @@ pub(crate) async fn run(args: CoordinatorArgs, stop: &CancellationToken) -> Resu
     let folder = private_folder(&args.state.unwrap_or_else(env::temp_dir))?;
     let listener =
         TcpListener::bind(address).await.with_context(|| format!("cannot listen on {address}"))?;
-    writeln!(io::stdout().lock(), "listening on http://{}", listener.local_addr()?)?;
+    writeln!(io::stdout().lock(), "listening on http://{}", listener.local_addr()?)
+        .context("cannot write to standard output")?;
 
     let coordinator = Coordinator::new(Config {
         version: VERSION.to_owned(),

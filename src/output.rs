@@ -16,6 +16,9 @@ use tokio_util::sync::CancellationToken;
 /// Where a picture goes and how it is written.
 #[derive(Debug, Clone)]
 pub(crate) struct Output {
+    /// As the user wrote it.
+    name: PathBuf,
+    /// Where the file is, links followed.
     path: PathBuf,
     format: PictureFormat,
 }
@@ -33,11 +36,12 @@ impl Output {
             }
             _ => bail!("the output {} must end in .png or .exr", path.display()),
         };
-        Ok(Self { path: path.to_owned(), format })
+        Ok(Self { name: path.to_owned(), path: path.to_owned(), format })
     }
 
-    pub(crate) fn path(&self) -> &Path {
-        &self.path
+    /// The path as the user wrote it.
+    pub(crate) fn name(&self) -> &Path {
+        &self.name
     }
 
     pub(crate) fn format(&self) -> PictureFormat {
@@ -52,7 +56,7 @@ impl Output {
     /// Finds out now whether the picture can be written later.
     pub(crate) fn check(&mut self) -> anyhow::Result<()> {
         if let Ok(metadata) = fs::metadata(&self.path) {
-            let path = self.path.display();
+            let path = self.name.display();
             ensure!(!metadata.is_dir(), "the output {path} is a folder");
             ensure!(metadata.is_file(), "the output {path} is there and is no plain file");
             // A link stays one: the file that it leads to is replaced.
@@ -71,7 +75,7 @@ impl Output {
         stop: &CancellationToken,
         write: impl FnOnce(&mut OutputFile<'_>) -> io::Result<()>,
     ) -> anyhow::Result<()> {
-        let in_place = || format!("cannot write {}", self.path.display());
+        let in_place = || format!("cannot write {}", self.name.display());
         let mut file = tempfile::Builder::new()
             .prefix(".rtfarm-")
             .permissions(fs::Permissions::from_mode(0o666))

@@ -41,7 +41,7 @@ pub(crate) struct Summary {
 
 impl Summary {
     /// Writes the one line that a render ends with.
-    pub(crate) fn tell(&self, started: Instant, output: &Output) -> io::Result<()> {
+    pub(crate) fn tell(&self, started: Instant, output: &Output) -> anyhow::Result<()> {
         let mrays = self.rays as f64 / 1e6;
         writeln!(
             io::stdout().lock(),
@@ -51,8 +51,9 @@ impl Summary {
             rate = mrays / self.rendering.as_secs_f64().max(1e-9),
             workers = self.workers,
             noun = if self.workers == 1 { "worker" } else { "workers" },
-            path = output.path().display()
+            path = output.name().display()
         )
+        .context("cannot write to standard output")
     }
 }
 
@@ -212,6 +213,7 @@ async fn render_with_workers(
             written.map(|()| rendering)
         }
         Err(failure) => {
+            coordinator.cancel(job.id());
             children.end(&coordinator).await;
             Err(failure)
         }

@@ -14,13 +14,15 @@ pub(crate) async fn run(args: WorkerArgs, stop: &CancellationToken) -> Result<()
     if let Some(parent) = args.parent {
         die_with_parent(parent)?;
     }
+    let is_local = args.parent.is_some();
     let config = Config {
         threads: args.threads(),
         isa: args.isa.0,
-        patience: if args.parent.is_some() { LOCAL_PATIENCE } else { args.patience },
+        patience: if is_local { LOCAL_PATIENCE } else { args.patience },
         coordinator: args.coordinator,
         version: args.claim_version,
     };
     rtfarm_worker::run(config, stop.cancelled()).await?;
-    if stop.is_cancelled() { Err(Failure::Interrupted) } else { Ok(()) }
+    // A local worker is stopped by its parent, which tells the user.
+    if stop.is_cancelled() && !is_local { Err(Failure::Interrupted) } else { Ok(()) }
 }

@@ -63,12 +63,12 @@ impl Job {
         self.progress.subscribe()
     }
 
-    /// Ends the job, unless it has ended.
-    pub(crate) fn end(&self, end: End) {
+    /// Ends the job, unless it has ended; says whether it had not.
+    pub(crate) fn end(&self, end: End) -> bool {
         self.progress.send_if_modified(|progress| {
             let is_first = progress.end.is_none();
             progress.end.get_or_insert(end);
             is_first
-        });
+        })
     }
 }

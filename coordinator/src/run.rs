@@ -139,8 +139,13 @@ impl Coordinator {
 
     /// Ends a job, if it has not ended, and forgets it.
     pub fn cancel(&self, job: JobId) {
-        self.shared.end(job, End::Failed("the job was cancelled".to_owned()));
-        self.shared.kept().remove(&job);
+        self.shared.jobs().on_end(job);
+        let forgotten = self.shared.kept().remove(&job);
+        if let Some(job) = forgotten
+            && job.end(End::Failed("it was cancelled".to_owned()))
+        {
+            tracing::info!(job = job.id.0, "job cancelled");
+        }
     }
 
     /// Event: the process of a worker on this machine is known to be dead.
@@ -238,12 +243,11 @@ impl Shared {
     pub(crate) fn end(&self, job: JobId, end: End) {
         self.jobs().on_end(job);
         if let Some(job) = self.job(job) {
-            if let End::Failed(reason) = &end
-                && job.progress.borrow().end.is_none()
-            {
+            let reason =
+                if let End::Failed(reason) = &end { reason.clone() } else { String::new() };
+            if job.end(end) && !reason.is_empty() {
                 tracing::warn!(job = job.id.0, reason, "job failed");
             }
-            job.end(end);
         }
     }
 
