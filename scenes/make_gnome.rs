@@ -29,9 +29,9 @@ fn main() -> std::io::Result<()> {
         "# A garden gnome and his bottle. Written by make_gnome.rs.\n\
          viewport\n\
          \torigin 0.5 2.1 7.6\n\
-         \ttopleft -1.8 3.05 4\n\
-         \tbottomleft -1.8 0.8 4\n\
-         \ttopright 2.2 3.05 4\n\
+         \ttopleft -1.22 2.72 4\n\
+         \tbottomleft -1.22 1 4\n\
+         \ttopright 1.84 2.72 4\n\
          \tsize 1280 720\n\
          \tbackground 176 206 236\n\
          endviewport\n\
@@ -42,16 +42,16 @@ fn main() -> std::io::Result<()> {
     }
     scene += "endmaterials\n\
               lights\n\
-              \tambient 0.28\n\
+              \tambient 0.32\n\
               \treference power 100 distance 9 endreference\n\
-              \tpoint coords 5.5 8 6.5 power 85 color 255 244 224 endpoint\n\
-              \tpoint coords -6 5 5 power 24 color 206 224 255 endpoint\n\
+              \tpoint coords 5.5 8 6.5 power 92 color 255 244 224 endpoint\n\
+              \tpoint coords -6 5 5 power 30 color 206 224 255 endpoint\n\
               endlights\n\
               geometry\n\
               \tquadrangle vertex -40 0 40 vertex 40 0 40 vertex 40 0 -40 vertex -40 0 -40 \
               material ground endquadrangle\n";
     gnome(&mut scene, -0.75);
-    bottle(&mut scene, 1.35, 0.35);
+    bottle(&mut scene, 1.0, 0.4);
     scene += "endgeometry\n";
     std::io::stdout().write_all(scene.as_bytes())
 }
@@ -93,8 +93,8 @@ fn gnome(scene: &mut String, x: f64) {
         let hand = if side > 0.0 { (1.2, 1.39, 0.47) } else { (-0.66, 0.66, 0.47) };
         ball(hand.0, hand.1, hand.2, 0.135, "skin");
         ball(hand.0 - side * 0.02, hand.1 + 0.09, hand.2 + 0.09, 0.055, "skin");
-        ball(side * 0.15, 1.83, 0.335, 0.05, "eye");
-        ball(side * 0.15 + 0.018, 1.845, 0.378, 0.014, "beard");
+        ball(side * 0.15, 1.86, 0.335, 0.05, "eye");
+        ball(side * 0.15 + 0.018, 1.876, 0.378, 0.014, "beard");
         ball(side * 0.2, 1.68, 0.27, 0.11, "nose");
         ball(side * 0.4, 1.74, 0.0, 0.09, "skin");
         for k in 0..7 {
@@ -108,7 +108,7 @@ fn gnome(scene: &mut String, x: f64) {
             );
             ball(
                 side * (0.08 + 0.13 * t),
-                1.93 + 0.03 * (1.0 - t),
+                1.945 + 0.025 * (1.0 - t),
                 0.345 - 0.02 * t,
                 0.035,
                 "beard",
@@ -139,7 +139,7 @@ fn gnome(scene: &mut String, x: f64) {
             let distance = 0.4 + 0.16 * t - 0.1 * t * t;
             ball(
                 distance * angle.sin() * (1.0 - 0.25 * t),
-                1.64 - 0.72 * t + 0.1 * (1.0 - t) * across * across + wave,
+                1.6 - 0.7 * t + 0.1 * (1.0 - t) * across * across + wave,
                 distance * angle.cos() + 0.03 - wave,
                 0.105 - 0.045 * t,
                 "beard",
@@ -152,17 +152,17 @@ fn gnome(scene: &mut String, x: f64) {
         let lean = t * t;
         ball(
             -0.3 * lean,
-            1.98 + 1.05 * t - 0.08 * lean * t,
+            2.12 + 0.98 * t - 0.08 * lean * t,
             -0.03 - 0.22 * lean,
-            0.42 * (1.0 - t) + 0.045,
+            0.38 * (1.0 - t) + 0.045,
             "hat",
         );
     }
     for k in 0..40 {
         let angle = TAU * f64::from(k) / 40.0;
-        ball(0.39 * angle.sin(), 1.97, 0.39 * angle.cos() - 0.02, 0.07, "hat");
+        ball(0.37 * angle.sin(), 2.07, 0.37 * angle.cos() - 0.02, 0.075, "hat");
     }
-    ball(-0.32, 2.98, -0.26, 0.1, "beard");
+    ball(-0.32, 3.06, -0.26, 0.1, "beard");
 }
 
 /// A lathe surface: the outline runs from the foot up to the lip, the cork stands in it.

@@ -53,10 +53,10 @@ pub enum SceneError {
     #[error("cannot fetch the prepared scene: {}", .0.message())]
     Fetch(#[from] Status),
     /// It is not the one that was promised.
-    #[error("the prepared scene is damaged: it does not have the hash it goes by")]
+    #[error("the prepared scene is another one: it does not have the hash it goes by")]
     Hash,
     /// It is not usable.
-    #[error("the prepared scene is damaged: {0}")]
+    #[error("cannot use the prepared scene: {0}")]
     Prepared(#[from] PreparedError),
 }
 
@@ -115,17 +115,10 @@ async fn fetch(
 }
 
 fn open(file: &File, job: &Description, pulse: &Pulse) -> Result<Arc<Scene>, SceneError> {
-    const PIECE_BYTES: usize = 1 << 24;
-    let map = Map::new(file)?;
-    let mut hasher = blake3::Hasher::new();
-    for piece in map.as_ref().chunks(PIECE_BYTES) {
-        hasher.update(piece);
-        pulse.beat();
-    }
-    if hasher.finalize().as_bytes() != &job.hash.0 {
+    let scene = PreparedScene::open_in_steps(Map::new(file)?, &mut || pulse.beat())?;
+    if scene.hash() != job.hash {
         return Err(SceneError::Hash);
     }
-    let scene = PreparedScene::open(map)?;
     pulse.beat();
     Ok(Arc::new(scene))
 }
