@@ -249,9 +249,8 @@ fn a_quadrangle_is_its_two_triangles() {
         let hits = oracle.all_hits(origin, direction, None);
         for quadrangle in &scene.quadrangles {
             let [a, b, c, d] = quadrangle.vertices;
-            let is_inside = |p: DVec3, q: DVec3, r: DVec3| {
-                (q - p).cross(r - p).dot(rtfarm_core::scene::newell_normal(&[a, b, c, d]))
-            };
+            let is_inside =
+                |p: DVec3, q: DVec3, r: DVec3| (q - p).cross(r - p).dot((c - a).cross(d - b));
             // Cut along the diagonal that lies inside.
             let halves = if is_inside(a, b, c) > 0. && is_inside(a, c, d) > 0. {
                 [[a, b, c], [a, c, d]]
