@@ -63,7 +63,7 @@ impl Console {
     }
 
     /// How diagnostics are drawn: in colours on a terminal, unless `NO_COLOR` is set.
-    pub(crate) fn drawing_style(&self) -> Style {
+    pub(crate) fn drawing_style() -> Style {
         let is_plain = std::env::var_os("NO_COLOR").is_some_and(|value| !value.is_empty());
         if io::stderr().is_terminal() && !is_plain { Style::Colored } else { Style::Plain }
     }

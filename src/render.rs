@@ -108,7 +108,7 @@ async fn place(
 ) -> Result<Order, Failure> {
     let wish = args.wish(output.format());
     let folder = if args.is_from_stdin() { ".".into() } else { folder_of(&args.scene) };
-    let (name, style) = (args.scene_name(), console.drawing_style());
+    let (name, style) = (args.scene_name(), Console::drawing_style());
     let placing = spawn_blocking(move || {
         let placed = wish.place(&text, &|path: &str| fs::read(folder.join(Path::new(path))));
         let mut report = draw_diagnostics(&name, &text, &placed.diagnostics, style);

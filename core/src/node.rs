@@ -185,19 +185,19 @@ impl BoxKernel for ScalarBoxes {
         // ray runs along) and a number, the second operand is taken.
         let larger = |a: f32, b: f32| if a > b { a } else { b };
         let smaller = |a: f32, b: f32| if a < b { a } else { b };
-        let mut enter = [ray.low; 8];
+        let mut distances = [ray.low; 8];
         let mut mask = 0;
-        for child in 0..8 {
+        for (child, enter) in distances.iter_mut().enumerate() {
             let mut leave = ray.high;
             for axis in 0..3 {
                 let near = node.planes[ray.near[axis]][child] - ray.near_origin[axis];
                 let far = node.planes[ray.far[axis]][child] - ray.far_origin[axis];
-                enter[child] = larger(near * ray.inverse[axis], enter[child]);
+                *enter = larger(near * ray.inverse[axis], *enter);
                 leave = smaller(far * ray.inverse[axis] * FAR, leave);
             }
-            mask |= u32::from(enter[child] <= leave) << child;
+            mask |= u32::from(*enter <= leave) << child;
         }
-        (enter, mask)
+        (distances, mask)
     }
 }
 

@@ -132,7 +132,7 @@ fn leading(equation: &[u64; 4]) -> Option<u64> {
 /// A finite number modulo the prime.
 fn residue(value: f64) -> u64 {
     let bits = value.to_bits();
-    let exponent = (bits >> 52 & 0x7FF) as i64;
+    let exponent = (bits >> 52 & 0x7FF).cast_signed();
     let fraction = bits & ((1 << 52) - 1);
     let mantissa = if exponent == 0 { fraction } else { fraction | 1 << 52 };
     let shift = (exponent.max(1) - 1075).rem_euclid(61) as u32;

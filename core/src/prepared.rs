@@ -453,7 +453,7 @@ fn unit_scale(scene: &Scene, viewport: &scene::Viewport) -> f64 {
 /// The power of two that brings `value` into 0.5..1; 1 for 0. Limited to where both it and its
 /// inverse are normal numbers.
 pub(crate) fn power_of_two_below_inverse(value: f64) -> f64 {
-    let exponent = (value.to_bits() >> 52 & 0x7FF) as i64 - 1022;
+    let exponent = (value.to_bits() >> 52 & 0x7FF).cast_signed() - 1022;
     let exponent = if value == 0.0 { 0 } else { exponent.clamp(-1020, 1020) };
     f64::from_bits(((1023 - exponent) as u64) << 52)
 }
@@ -571,11 +571,11 @@ impl<'a> Faces<'a> {
             self.shared.push(plane);
         }
         // Quadrangles that are flat only within rounding have planes of their own.
-        for face in triangles..self.flat_count() {
-            if matches!(planes[face], FacePlane::Own) {
-                planes[face] = FacePlane::Shared(PlaneIndex(self.shared.len() as u32));
-                let plane = self.plane_of(face);
-                self.shared.push(plane);
+        for (face, plane) in planes.iter_mut().enumerate().skip(triangles) {
+            if matches!(plane, FacePlane::Own) {
+                *plane = FacePlane::Shared(PlaneIndex(self.shared.len() as u32));
+                let record = self.plane_of(face);
+                self.shared.push(record);
             }
         }
         self.planes = planes;

@@ -106,7 +106,7 @@ impl Item {
 pub(crate) struct Shear {
     axes: [usize; 3],
     origin: [f64; 3],
-    shear: [f64; 3],
+    slopes: [f64; 3],
 }
 
 /// A vertex as a ray sees it.
@@ -135,7 +135,7 @@ impl Shear {
         Self {
             axes: [x, y, z],
             origin: [o[x], o[y], o[z]],
-            shear: [d[x] / d[z], d[y] / d[z], 1.0 / d[z]],
+            slopes: [d[x] / d[z], d[y] / d[z], 1.0 / d[z]],
         }
     }
 
@@ -145,9 +145,9 @@ impl Shear {
         let [x, y, z] = self.axes;
         let depth = vertex[z] - self.origin[2];
         Projected {
-            x: (vertex[x] - self.origin[0]) - self.shear[0] * depth,
-            y: (vertex[y] - self.origin[1]) - self.shear[1] * depth,
-            z: self.shear[2] * depth,
+            x: (vertex[x] - self.origin[0]) - self.slopes[0] * depth,
+            y: (vertex[y] - self.origin[1]) - self.slopes[1] * depth,
+            z: self.slopes[2] * depth,
         }
     }
 }

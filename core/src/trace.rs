@@ -178,10 +178,7 @@ impl<'a> Nearest<'a> {
 
     #[inline(always)]
     fn meet(&mut self, view: &View<'_>, item: Item) {
-        let (t, rank) = match meet(view, self.ray, &self.shear, item) {
-            Some(met) => met,
-            None => return,
-        };
+        let Some((t, rank)) = meet(view, self.ray, &self.shear, item) else { return };
         if t < self.hit.t || (t == self.hit.t && rank < self.hit.rank && self.hit.is_some()) {
             self.hit = Hit { t, rank, item };
         }
