@@ -187,7 +187,7 @@ fn bottle(scene: &mut String, x: f64, z: f64) {
     };
     for j in 0..profile.len() - 1 {
         for i in 0..AROUND {
-            let middle = (profile[j].1 + profile[j + 1].1) / 2.0;
+            let middle = f64::midpoint(profile[j].1, profile[j + 1].1);
             let from_front = (i as f64 + 0.5) / AROUND as f64 * 2.0 - 1.0;
             let material = if j >= corks {
                 "cork"

@@ -1,7 +1,7 @@
 //! The prepared scene: one flat, position-independent, versioned, checksummed block of bytes that
 //! is built once and mapped by every process that renders from it.
 //!
-//! The block is a [`Header`] and sections of plain records, each section aligned to 64 bytes.
+//! The block is a header and sections of plain records, each section aligned to 64 bytes.
 //! Coordinates are the scene's times a power of two that brings the largest of them into 0.5..1,
 //! so that no scale can overflow or underflow and a scaled scene gives the same bits. Loading
 //! checks every index, bound and number once; after that nothing is checked twice.
