@@ -12,8 +12,9 @@ use glam::DVec3;
 use rayon::prelude::*;
 use rtfarm_core::{
     isa::Isa,
-    prepared::{PreparedScene, prepare},
-    render::{Settings, render_tile},
+    prepare::prepare,
+    prepared::PreparedScene,
+    render::{DEFAULT_CUTOFF, Settings, render_tile},
     scene::{Light, Material, Quadrangle, Scene, Triangle, Viewport},
     tile::{Size, TileGrid},
 };
@@ -47,7 +48,7 @@ fn main() {
     let size = Size::new(1280, 720).expect("a size");
     let grid = TileGrid::balanced(size);
     for flat in [true, false] {
-        let settings = Settings { size, samples: 1, seed: 0, flat };
+        let settings = Settings { size, samples: 1, seed: 0, flat, cutoff: DEFAULT_CUTOFF };
         for isa in Isa::ALL.into_iter().filter(|isa| isa.is_supported()) {
             for threads in [1, 2] {
                 let pool =

@@ -20,6 +20,7 @@ mod triangles;
 mod bvh;
 mod node;
 mod plane;
+pub mod prepare;
 pub mod prepared;
 mod weld;
 
@@ -30,6 +31,7 @@ mod quadrangle;
 mod ray;
 pub mod render;
 pub mod sample;
+mod solid;
 mod sphere;
 pub mod tile;
 pub mod trace;

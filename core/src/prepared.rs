@@ -6,23 +6,22 @@
 //! so that no scale can overflow or underflow and a scaled scene gives the same bits. Loading
 //! checks every index, bound and number once; after that nothing is checked twice.
 
+use std::ops::Range;
+
 use glam::DVec3;
 
 use crate::{
-    bvh::{self, Bounds, Leaflet},
-    exact::is_coplanar,
-    node::{self, Child, Frame, Node},
-    plane,
+    bvh,
+    node::{Child, Frame, Node},
     ray::{Item, Kind, Surface},
-    scene::{self, Material, Place, Scene},
-    triangle::triangle_normal,
-    weld::weld,
+    scene::{Material, Sphere},
+    solid::{self, NodeRecord},
 };
 
 const MAGIC: [u8; 8] = *b"rtfarm\r\n";
 
 /// Changes with the layout or the meaning of any byte.
-const VERSION: u32 = 1;
+const VERSION: u32 = 2;
 
 /// Reads differently on a machine of the other byte order.
 const BYTE_ORDER: u32 = 0x0102_0304;
@@ -34,38 +33,6 @@ pub struct SceneHash(pub [u8; 32]);
 impl std::fmt::Display for SceneHash {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         f.write_str(&blake3::Hash::from_bytes(self.0).to_hex())
-    }
-}
-
-/// Why a scene cannot be prepared.
-#[derive(Debug, Clone, PartialEq, thiserror::Error)]
-pub enum PrepareError {
-    /// There is nothing to look through.
-    #[error("a picture needs a `viewport` block with origin, topleft, bottomleft and topright")]
-    NoViewport,
-    /// Something that the language has and the tracer does not.
-    #[error("{feature} cannot be rendered yet")]
-    Unsupported {
-        /// What, as its author would say it.
-        feature: String,
-        /// Where the file asks for it.
-        at: Place,
-    },
-    /// More faces than indices reach.
-    #[error("the scene has {0} faces; at most {limit} can be rendered", limit = Child::ITEM_LIMIT)]
-    TooManyFaces(u64),
-    /// A light that, seen in the scene's own units, is no finite number.
-    #[error("light {0} (counted from 1) is too strong for numbers to hold")]
-    Light(usize),
-}
-
-impl PrepareError {
-    /// The place in the scene's text that it is about, if it is about one.
-    pub fn place(&self) -> Option<Place> {
-        match self {
-            Self::Unsupported { at, .. } => Some(*at),
-            _ => None,
-        }
     }
 }
 
@@ -94,13 +61,32 @@ pub(crate) struct Header {
     sections: [Section; SECTIONS],
     pub(crate) camera: Camera,
     pub(crate) frame: Frame,
-    pub(crate) background: [f64; 3],
-    pub(crate) ambient: [f64; 3],
+    pub(crate) lighting: Lighting,
     /// Scene coordinates times this are the block's: a power of two.
     pub(crate) scale: f64,
-    /// 1 when the scene defines light; 0 for plain colours.
+    pub(crate) features: Features,
+}
+
+/// What the scene needs of the tracer; 1 or 0 each.
+#[derive(Debug, Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
+#[repr(C)]
+pub(crate) struct Features {
+    /// The scene defines light; else it shows plain colours.
     pub(crate) is_lit: u32,
-    padding: u32,
+    /// Something mirrors or lets light through.
+    pub(crate) has_branches: u32,
+    /// A shadow may let light through.
+    pub(crate) has_clear_shadows: u32,
+    /// There are constructive solids.
+    pub(crate) has_solids: u32,
+}
+
+/// Light that comes from everywhere.
+#[derive(Debug, Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
+#[repr(C)]
+pub(crate) struct Lighting {
+    pub(crate) background: [f64; 3],
+    pub(crate) ambient: [f64; 3],
 }
 
 const HASHED_FROM: usize = 16 + 32;
@@ -154,6 +140,12 @@ pub(crate) struct QuadrangleRecord {
     padding: u32,
 }
 
+impl QuadrangleRecord {
+    pub(crate) fn new(vertices: [u32; 4], material: u32, rank: u32, plane: PlaneIndex) -> Self {
+        Self { vertices, material, rank, plane, padding: 0 }
+    }
+}
+
 #[derive(Debug, Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
 #[repr(C)]
 pub(crate) struct SphereRecord {
@@ -164,6 +156,82 @@ pub(crate) struct SphereRecord {
     /// Equal spheres have one surface.
     pub(crate) surface: u32,
     padding: u32,
+}
+
+impl SphereRecord {
+    pub(crate) fn new(center: DVec3, radius: f64, material: u32, rank: u32) -> Self {
+        Self { center: center.to_array(), radius, material, rank, surface: rank, padding: 0 }
+    }
+}
+
+/// A constructive solid: runs of nodes and of leaves.
+#[derive(Debug, Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
+#[repr(C)]
+pub(crate) struct SolidRecord {
+    first_node: u32,
+    node_count: u32,
+    first_leaf: u32,
+    leaf_count: u32,
+    /// The rank of its first leaf's first face; each leaf has six.
+    pub(crate) rank: u32,
+}
+
+impl SolidRecord {
+    pub(crate) fn new(nodes: Range<usize>, leaves: Range<usize>, rank: u32) -> Self {
+        Self {
+            first_node: nodes.start as u32,
+            node_count: nodes.len() as u32,
+            first_leaf: leaves.start as u32,
+            leaf_count: leaves.len() as u32,
+            rank,
+        }
+    }
+
+    pub(crate) fn nodes(&self) -> Range<usize> {
+        self.first_node as usize..self.first_node as usize + self.node_count as usize
+    }
+
+    pub(crate) fn leaves(&self) -> Range<usize> {
+        self.first_leaf as usize..self.first_leaf as usize + self.leaf_count as usize
+    }
+}
+
+/// A leaf of a constructive solid: a sphere, or a parallelepiped by its planes.
+#[derive(Debug, Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
+#[repr(C)]
+pub(crate) struct LeafRecord {
+    pub(crate) center: [f64; 3],
+    /// 0 for a parallelepiped.
+    pub(crate) radius: f64,
+    /// Of a parallelepiped; they look outward.
+    pub(crate) planes: [PlaneIndex; 6],
+    pub(crate) material: u32,
+    /// Its node in the solid's tree.
+    pub(crate) node: u32,
+    /// 1 when it is taken away: its faces look inward.
+    pub(crate) is_turned: u32,
+    /// Of a sphere.
+    pub(crate) surface: u32,
+}
+
+impl LeafRecord {
+    pub(crate) fn sphere(sphere: &Sphere, node: u32) -> Self {
+        Self {
+            center: sphere.center.to_array(),
+            radius: sphere.radius,
+            ..Self::parallelepiped(sphere.material, node)
+        }
+    }
+
+    pub(crate) fn parallelepiped(material: u32, node: u32) -> Self {
+        let planes = [PlaneIndex(0); 6];
+        Self { center: [0.0; 3], radius: 0.0, planes, material, node, is_turned: 0, surface: 0 }
+    }
+
+    #[inline(always)]
+    pub(crate) fn is_sphere(&self) -> bool {
+        self.radius > 0.0
+    }
 }
 
 /// A plane that faces share.
@@ -181,6 +249,10 @@ pub(crate) struct PlaneRecord {
 pub(crate) struct PlaneIndex(u32);
 
 impl PlaneIndex {
+    pub(crate) fn new(index: usize, is_turned: bool) -> Self {
+        Self(index as u32 | u32::from(is_turned) << 31)
+    }
+
     #[inline(always)]
     pub(crate) fn index(self) -> usize {
         (self.0 & !(1 << 31)) as usize
@@ -202,6 +274,24 @@ impl PlaneIndex {
 #[repr(C)]
 pub(crate) struct MaterialRecord {
     pub(crate) color: [f64; 3],
+    /// The mirrored share.
+    pub(crate) reflect: f64,
+    /// The share of the rest that is the surface's own.
+    pub(crate) alpha: f64,
+    /// n1/n2 from the front; 0 and 1 do not bend.
+    pub(crate) refract: f64,
+}
+
+impl MaterialRecord {
+    pub(crate) fn new(material: &Material) -> Self {
+        let Material { color, reflect, alpha, refract, .. } = *material;
+        Self { color: color.to_array(), reflect, alpha, refract }
+    }
+
+    /// What a shadow ray keeps when it crosses a face.
+    pub(crate) fn clearness(&self) -> f64 {
+        (1.0 - self.alpha) * (1.0 - self.reflect)
+    }
 }
 
 #[derive(Debug, Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
@@ -214,23 +304,76 @@ pub(crate) struct LightRecord {
     touches_count: u32,
 }
 
-const SECTIONS: usize = 11;
+impl LightRecord {
+    pub(crate) fn new(position: DVec3, intensity: DVec3, first: u32, count: u32) -> Self {
+        Self {
+            position: position.to_array(),
+            intensity: intensity.to_array(),
+            touches_first: first,
+            touches_count: count,
+        }
+    }
+}
 
-/// The sections of a block, in their order.
+/// Declares the sections of a block, once for all that go through them in order.
+macro_rules! sections {
+    ($($name:ident: $record:ty,)*) => {
+        /// The sections of a block, in their order.
+        #[derive(Debug, Clone, Copy)]
+        pub(crate) struct Sections<'a> {
+            $(pub(crate) $name: &'a [$record],)*
+        }
+
+        const SECTIONS: usize = [$(stringify!($name)),*].len();
+
+        /// The record sizes of the sections, in their order.
+        const RECORD_SIZES: [usize; SECTIONS] = [$(size_of::<$record>()),*];
+
+        impl<'a> Sections<'a> {
+            fn to_bytes(self) -> [&'a [u8]; SECTIONS] {
+                [$(bytemuck::cast_slice(self.$name)),*]
+            }
+
+            fn from_bytes(sections: [&'a [u8]; SECTIONS]) -> Self {
+                let [$($name),*] = sections;
+                Self { $($name: bytemuck::cast_slice($name),)* }
+            }
+        }
+    };
+}
+
+sections! {
+    nodes: Node,
+    items: Item,
+    vertices: [f64; 3],
+    triangles: TriangleRecord,
+    coplanars: CoplanarRecord,
+    quadrangles: QuadrangleRecord,
+    spheres: SphereRecord,
+    planes: PlaneRecord,
+    materials: MaterialRecord,
+    lights: LightRecord,
+    touches: Surface,
+    solids: SolidRecord,
+    solid_nodes: NodeRecord,
+    leaves: LeafRecord,
+    first_ranks: u32,
+}
+
+/// A block as the tracer reads it.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct View<'a> {
     pub(crate) header: &'a Header,
-    pub(crate) nodes: &'a [Node],
-    pub(crate) items: &'a [Item],
-    pub(crate) vertices: &'a [[f64; 3]],
-    pub(crate) triangles: &'a [TriangleRecord],
-    pub(crate) coplanars: &'a [CoplanarRecord],
-    pub(crate) quadrangles: &'a [QuadrangleRecord],
-    pub(crate) spheres: &'a [SphereRecord],
-    pub(crate) planes: &'a [PlaneRecord],
-    pub(crate) materials: &'a [MaterialRecord],
-    pub(crate) lights: &'a [LightRecord],
-    touches: &'a [Surface],
+    sections: Sections<'a>,
+}
+
+impl<'a> std::ops::Deref for View<'a> {
+    type Target = Sections<'a>;
+
+    #[inline(always)]
+    fn deref(&self) -> &Sections<'a> {
+        &self.sections
+    }
 }
 
 impl<'a> View<'a> {
@@ -239,6 +382,22 @@ impl<'a> View<'a> {
     pub(crate) fn touches(&self, light: &LightRecord) -> &'a [Surface] {
         let first = light.touches_first as usize;
         &self.touches[first..first + light.touches_count as usize]
+    }
+
+    pub(crate) fn solid_nodes(&self, solid: &SolidRecord) -> &'a [NodeRecord] {
+        &self.sections.solid_nodes[solid.nodes()]
+    }
+
+    pub(crate) fn solid_leaves(&self, solid: &SolidRecord) -> &'a [LeafRecord] {
+        &self.sections.leaves[solid.leaves()]
+    }
+
+    /// The primitive and its face that have a rank.
+    pub(crate) fn primitive_and_face(&self, rank: u32) -> (u32, u32) {
+        match self.first_ranks.partition_point(|&first| first <= rank).checked_sub(1) {
+            Some(primitive) => (primitive as u32, rank - self.first_ranks[primitive]),
+            None => (rank, 0),
+        }
     }
 
     #[inline(always)]
@@ -287,96 +446,27 @@ impl AsRef<[u8]> for PreparedBytes {
     }
 }
 
-/// Turns a scene into a prepared scene, on rayon's threads; the same scene gives the same bytes on
-/// any number of them.
-pub fn prepare(scene: &Scene) -> Result<PreparedBytes, PrepareError> {
-    let viewport = scene.viewport.ok_or(PrepareError::NoViewport)?;
-    refuse_unsupported(scene)?;
-    let count = scene.triangles.len() + scene.quadrangles.len() + scene.spheres.len();
-    if count > Child::ITEM_LIMIT {
-        return Err(PrepareError::TooManyFaces(count as u64));
-    }
-    let scale = unit_scale(scene, &viewport);
-    let faces = Faces::new(scene, scale);
-    let frame = faces.frame();
-    let mut leaflets = faces.leaflets(&frame);
-    let nodes = bvh::build_bvh(&mut leaflets);
-    let sorted = faces.sort(&leaflets);
-
-    let mut lights = Vec::with_capacity(scene.lights.len());
-    let mut touches = Vec::new();
-    for (k, light) in scene.lights.iter().enumerate() {
-        let position = light.position * scale;
-        let intensity = light.intensity * scale * scale;
-        if !intensity.is_finite() {
-            return Err(PrepareError::Light(k + 1));
-        }
-        let surfaces = sorted.surfaces_at(position);
-        lights.push(LightRecord {
-            position: position.to_array(),
-            intensity: intensity.to_array(),
-            touches_first: touches.len() as u32,
-            touches_count: surfaces.len() as u32,
-        });
-        touches.extend(surfaces);
-    }
-    let materials: Vec<MaterialRecord> =
-        scene.materials.iter().map(|m| MaterialRecord { color: m.color.to_array() }).collect();
-
-    let [eye, top_left, bottom_left, top_right] =
-        [viewport.eye, viewport.top_left, viewport.bottom_left, viewport.top_right]
-            .map(|point| point * scale);
-    let header = Header {
+/// Lays the parts of a prepared scene out as one block.
+pub(crate) fn assemble(
+    camera: Camera,
+    lighting: Lighting,
+    frame: Frame,
+    scale: f64,
+    features: Features,
+    sections: &Sections<'_>,
+) -> PreparedBytes {
+    let sections = sections.to_bytes();
+    let mut header = Header {
         magic: MAGIC,
         version: VERSION,
         byte_order: BYTE_ORDER,
-        camera: Camera {
-            eye: eye.to_array(),
-            top_left: (top_left - eye).to_array(),
-            right: (top_right - top_left).to_array(),
-            down: (bottom_left - top_left).to_array(),
-        },
+        camera,
+        lighting,
         frame,
-        background: scene.background.to_array(),
-        ambient: scene.ambient.unwrap_or_default().to_array(),
         scale,
-        is_lit: u32::from(scene.ambient.is_some() || !scene.lights.is_empty()),
+        features,
         ..bytemuck::Zeroable::zeroed()
     };
-    Ok(assemble(
-        header,
-        [
-            bytemuck::cast_slice(&nodes),
-            bytemuck::cast_slice(&sorted.items),
-            bytemuck::cast_slice(&sorted.vertices),
-            bytemuck::cast_slice(&sorted.triangles),
-            bytemuck::cast_slice(&sorted.coplanars),
-            bytemuck::cast_slice(&sorted.quadrangles),
-            bytemuck::cast_slice(&sorted.spheres),
-            bytemuck::cast_slice(&sorted.planes),
-            bytemuck::cast_slice(&materials),
-            bytemuck::cast_slice(&lights),
-            bytemuck::cast_slice(&touches),
-        ],
-    ))
-}
-
-/// The record sizes of the sections, in their order.
-const RECORD_SIZES: [usize; SECTIONS] = [
-    size_of::<Node>(),
-    size_of::<Item>(),
-    size_of::<[f64; 3]>(),
-    size_of::<TriangleRecord>(),
-    size_of::<CoplanarRecord>(),
-    size_of::<QuadrangleRecord>(),
-    size_of::<SphereRecord>(),
-    size_of::<PlaneRecord>(),
-    size_of::<MaterialRecord>(),
-    size_of::<LightRecord>(),
-    size_of::<Surface>(),
-];
-
-fn assemble(mut header: Header, sections: [&[u8]; SECTIONS]) -> PreparedBytes {
     let mut end = size_of::<Header>();
     for (k, section) in sections.iter().enumerate() {
         let offset = end.next_multiple_of(64);
@@ -396,363 +486,12 @@ fn assemble(mut header: Header, sections: [&[u8]; SECTIONS]) -> PreparedBytes {
     block
 }
 
-/// What the tracer cannot do yet is refused, never ignored; a material that no face wears is not.
-fn refuse_unsupported(scene: &Scene) -> Result<(), PrepareError> {
-    let unsupported =
-        |feature: &str, at: Place| PrepareError::Unsupported { feature: feature.to_owned(), at };
-    if let Some(mesh) = scene.meshes.first() {
-        return Err(unsupported("a mesh", mesh.at));
-    }
-    if let Some(solid) = scene.solids.first() {
-        return Err(unsupported("a constructive solid", solid.at));
-    }
-    let mut is_worn = vec![false; scene.materials.len()];
-    let worn = (scene.triangles.iter().map(|face| face.material))
-        .chain(scene.quadrangles.iter().map(|face| face.material))
-        .chain(scene.spheres.iter().map(|face| face.material))
-        .chain(scene.parallelepipeds.iter().map(|face| face.material));
-    for material in worn {
-        is_worn[material as usize] = true;
-    }
-    let nowhere = Place { line: 1, column: 1 };
-    for (Material { name, alpha, reflect, texture, places, .. }, _) in
-        scene.materials.iter().zip(is_worn).filter(|(_, is_worn)| *is_worn)
-    {
-        if *reflect > 0.0 {
-            let at = places.reflect.unwrap_or(nowhere);
-            return Err(unsupported(&format!("the mirror `{name}` (reflect above 0)"), at));
-        }
-        if *alpha < 1.0 {
-            let at = places.alpha.or(places.refract).unwrap_or(nowhere);
-            return Err(unsupported(&format!("the transparent `{name}` (alpha below 1)"), at));
-        }
-        if texture.is_some() {
-            let at = places.texture.unwrap_or(nowhere);
-            return Err(unsupported(&format!("the texture of `{name}`"), at));
-        }
-    }
-    if !scene.parallelepipeds.is_empty() {
-        return Err(unsupported("a parallelepiped", nowhere));
-    }
-    Ok(())
-}
-
-/// The power of two that brings the largest coordinate of anything into 0.5..1.
-fn unit_scale(scene: &Scene, viewport: &scene::Viewport) -> f64 {
-    let largest = |point: DVec3| point.abs().max_element();
-    let screen = [viewport.eye, viewport.top_left, viewport.bottom_left, viewport.top_right];
-    let extent = (screen.into_iter().map(largest))
-        .chain(scene.lights.iter().map(|light| largest(light.position)))
-        .chain(scene.triangles.iter().flat_map(|face| face.vertices.map(largest)))
-        .chain(scene.quadrangles.iter().flat_map(|face| face.vertices.map(largest)))
-        .chain(scene.spheres.iter().map(|sphere| largest(sphere.center).max(sphere.radius)))
-        .fold(0.0, f64::max);
-    power_of_two_below_inverse(extent)
-}
-
 /// The power of two that brings `value` into 0.5..1; 1 for 0. Limited to where both it and its
 /// inverse are normal numbers.
 pub(crate) fn power_of_two_below_inverse(value: f64) -> f64 {
     let exponent = (value.to_bits() >> 52 & 0x7FF).cast_signed() - 1022;
     let exponent = if value == 0.0 { 0 } else { exponent.clamp(-1020, 1020) };
     f64::from_bits(((1023 - exponent) as u64) << 52)
-}
-
-/// All faces of a scene, in the block's units: triangles, then quadrangles, then spheres.
-struct Faces<'a> {
-    scene: &'a Scene,
-    scale: f64,
-    /// The plane of each flat face.
-    planes: Vec<FacePlane>,
-    shared: Vec<PlaneRecord>,
-    /// Which vertex each corner of each flat face is: the first corner at that place.
-    welded: Vec<u32>,
-    corners: Vec<DVec3>,
-}
-
-/// How a flat face knows its plane.
-#[derive(Clone, Copy)]
-enum FacePlane {
-    /// A triangle that is alone in its plane.
-    Own,
-    /// All quadrangles, and triangles that have company.
-    Shared(PlaneIndex),
-}
-
-/// Faces in the order of the hierarchy's leaves.
-struct Sorted {
-    items: Vec<Item>,
-    vertices: Vec<[f64; 3]>,
-    triangles: Vec<TriangleRecord>,
-    coplanars: Vec<CoplanarRecord>,
-    quadrangles: Vec<QuadrangleRecord>,
-    spheres: Vec<SphereRecord>,
-    planes: Vec<PlaneRecord>,
-}
-
-impl<'a> Faces<'a> {
-    fn new(scene: &'a Scene, scale: f64) -> Self {
-        let corners: Vec<DVec3> = (scene.triangles.iter().flat_map(|face| face.vertices))
-            .chain(scene.quadrangles.iter().flat_map(|face| face.vertices))
-            .map(|corner| corner * scale)
-            .collect();
-        let welded = weld(&corners);
-        let mut faces =
-            Self { scene, scale, planes: Vec::new(), shared: Vec::new(), welded, corners };
-        faces.find_planes();
-        faces
-    }
-
-    fn flat_count(&self) -> usize {
-        self.scene.triangles.len() + self.scene.quadrangles.len()
-    }
-
-    /// The corners of a flat face.
-    fn corners(&self, face: usize) -> &[DVec3] {
-        let range = self.corner_range(face);
-        &self.corners[range]
-    }
-
-    fn corner_range(&self, face: usize) -> std::ops::Range<usize> {
-        let triangles = self.scene.triangles.len();
-        if face < triangles {
-            3 * face..3 * face + 3
-        } else {
-            let first = 3 * triangles + 4 * (face - triangles);
-            first..first + 4
-        }
-    }
-
-    fn rank(&self, face: usize) -> u32 {
-        let triangles = self.scene.triangles.len();
-        if face < triangles {
-            self.scene.triangles[face].primitive
-        } else {
-            self.scene.quadrangles[face - triangles].primitive
-        }
-    }
-
-    /// Gives flat faces in exactly one plane one record, that of the face that comes first.
-    fn find_planes(&mut self) {
-        let triangles = self.scene.triangles.len();
-        let prints = plane::plane_prints(self.flat_count(), |face| {
-            let corners = self.corners(face);
-            match *corners {
-                // Any three corners do that are not in a line, if all four are in one plane.
-                [a, b, c, d] if (b - a).cross(c - a) == DVec3::ZERO => [a, c, d],
-                _ => [corners[0], corners[1], corners[2]],
-            }
-        });
-        let mut by_plane: Vec<(u64, u32, u32)> = prints
-            .into_iter()
-            .enumerate()
-            .filter(|&(face, _)| match *self.corners(face) {
-                [a, b, c, d] => is_coplanar(a, b, c, d),
-                _ => true,
-            })
-            .filter_map(|(face, print)| Some((print?, self.rank(face), face as u32)))
-            .collect();
-        rayon::slice::ParallelSliceMut::par_sort_unstable(by_plane.as_mut_slice());
-
-        let mut planes = vec![FacePlane::Own; self.flat_count()];
-        for group in by_plane.chunk_by(|a, b| a.0 == b.0) {
-            let first = group[0].2 as usize;
-            if group.len() == 1 && first < triangles {
-                continue;
-            }
-            let plane = self.plane_of(first);
-            let index = self.shared.len() as u32;
-            for &(_, _, face) in group {
-                let normal = plane::unit_normal(self.corners(face as usize));
-                let reversed = normal.dot(DVec3::from_array(plane.normal)) < 0.0;
-                planes[face as usize] =
-                    FacePlane::Shared(PlaneIndex(index | u32::from(reversed) << 31));
-            }
-            self.shared.push(plane);
-        }
-        // Quadrangles that are flat only within rounding have planes of their own.
-        for (face, plane) in planes.iter_mut().enumerate().skip(triangles) {
-            if matches!(plane, FacePlane::Own) {
-                *plane = FacePlane::Shared(PlaneIndex(self.shared.len() as u32));
-                let record = self.plane_of(face);
-                self.shared.push(record);
-            }
-        }
-        self.planes = planes;
-    }
-
-    /// The plane through the mean corner with Newell's normal.
-    fn plane_of(&self, face: usize) -> PlaneRecord {
-        let corners = self.corners(face);
-        let from_first: DVec3 = corners.iter().map(|&corner| corner - corners[0]).sum();
-        let mean = corners[0] + from_first / corners.len() as f64;
-        PlaneRecord { point: mean.to_array(), normal: plane::unit_normal(corners).to_array() }
-    }
-
-    fn frame(&self) -> Frame {
-        let spheres = self.scene.spheres.iter().flat_map(|sphere| {
-            let (center, radius) = (sphere.center * self.scale, sphere.radius * self.scale);
-            [center - radius, center + radius]
-        });
-        let (mut min, mut max) = (DVec3::INFINITY, DVec3::NEG_INFINITY);
-        for point in self.corners.iter().copied().chain(spheres) {
-            (min, max) = (min.min(point), max.max(point));
-        }
-        if min.x > max.x {
-            return Frame { origin: [0.0; 3], scale: 1.0 };
-        }
-        let origin = min + (max - min) / 2.0;
-        let extent = (max - origin).max(origin - min).max_element();
-        Frame { origin: origin.to_array(), scale: power_of_two_below_inverse(extent) }
-    }
-
-    fn leaflets(&self, frame: &Frame) -> Vec<Leaflet> {
-        use rayon::prelude::*;
-        let origin = DVec3::from_array(frame.origin);
-        let bounds = |min: DVec3, max: DVec3| {
-            // Rounding to f64 must not pull a box in.
-            let relative = |point: DVec3| ((point - origin) * frame.scale).to_array();
-            Bounds {
-                min: relative(min).map(|x| node::below(x - x.abs() * f64::EPSILON)),
-                max: relative(max).map(|x| node::above(x + x.abs() * f64::EPSILON)),
-            }
-        };
-        let flat = (0..self.flat_count()).into_par_iter().map(|face| {
-            let corners = self.corners(face);
-            let min = corners.iter().copied().reduce(DVec3::min).expect("corners");
-            let max = corners.iter().copied().reduce(DVec3::max).expect("corners");
-            Leaflet { bounds: bounds(min, max), face: face as u32 }
-        });
-        let spheres = self.scene.spheres.par_iter().enumerate().map(|(k, sphere)| {
-            let (center, radius) = (sphere.center * self.scale, sphere.radius * self.scale);
-            let radius = radius + (radius + center.abs().max_element()) * f64::EPSILON;
-            let face = (self.flat_count() + k) as u32;
-            Leaflet { bounds: bounds(center - radius, center + radius), face }
-        });
-        flat.chain(spheres).collect()
-    }
-
-    fn sort(&self, leaflets: &[Leaflet]) -> Sorted {
-        let triangles = self.scene.triangles.len();
-        let sphere_surfaces = self.sphere_surfaces();
-        let mut sorted = Sorted {
-            items: Vec::with_capacity(leaflets.len()),
-            vertices: Vec::new(),
-            triangles: Vec::new(),
-            coplanars: Vec::new(),
-            quadrangles: Vec::new(),
-            spheres: Vec::new(),
-            planes: self.shared.clone(),
-        };
-        // Vertices are numbered in the order in which leaves come to them.
-        let mut numbers = vec![u32::MAX; self.corners.len()];
-        for leaflet in leaflets {
-            let face = leaflet.face as usize;
-            if face >= self.flat_count() {
-                let sphere = &self.scene.spheres[face - self.flat_count()];
-                sorted.items.push(Item::new(Kind::Sphere, sorted.spheres.len()));
-                sorted.spheres.push(SphereRecord {
-                    center: (sphere.center * self.scale).to_array(),
-                    radius: sphere.radius * self.scale,
-                    material: sphere.material,
-                    rank: sphere.primitive,
-                    surface: sphere_surfaces[face - self.flat_count()],
-                    padding: 0,
-                });
-                continue;
-            }
-            let mut vertices = [0; 4];
-            for (slot, corner) in vertices.iter_mut().zip(self.corner_range(face)) {
-                let number = &mut numbers[self.welded[corner] as usize];
-                if *number == u32::MAX {
-                    *number = sorted.vertices.len() as u32;
-                    sorted.vertices.push(self.corners[corner].to_array());
-                }
-                *slot = *number;
-            }
-            let [a, b, c, _] = vertices;
-            let rank = self.rank(face);
-            match self.planes[face] {
-                FacePlane::Shared(plane) if face >= triangles => {
-                    let material = self.scene.quadrangles[face - triangles].material;
-                    sorted.items.push(Item::new(Kind::Quadrangle, sorted.quadrangles.len()));
-                    let record = QuadrangleRecord { vertices, material, rank, plane, padding: 0 };
-                    sorted.quadrangles.push(record);
-                }
-                FacePlane::Shared(plane) => {
-                    let material = self.scene.triangles[face].material;
-                    sorted.items.push(Item::new(Kind::Coplanar, sorted.coplanars.len()));
-                    let record = CoplanarRecord { vertices: [a, b, c], material, rank, plane };
-                    sorted.coplanars.push(record);
-                }
-                FacePlane::Own => {
-                    let material = self.scene.triangles[face].material;
-                    sorted.items.push(Item::new(Kind::Triangle, sorted.triangles.len()));
-                    sorted.triangles.push(TriangleRecord { vertices: [a, b, c], material, rank });
-                }
-            }
-        }
-        sorted
-    }
-
-    /// The surface of each sphere: the rank of the first one equal to it.
-    fn sphere_surfaces(&self) -> Vec<u32> {
-        let mut firsts = std::collections::HashMap::new();
-        self.scene
-            .spheres
-            .iter()
-            .map(|sphere| {
-                let [x, y, z] = sphere.center.to_array().map(f64::to_bits);
-                *firsts.entry([x, y, z, sphere.radius.to_bits()]).or_insert(sphere.primitive)
-            })
-            .collect()
-    }
-}
-
-impl Sorted {
-    /// The surfaces that a point lies on, within rounding.
-    fn surfaces_at(&self, point: DVec3) -> Vec<Surface> {
-        let mut surfaces = Vec::new();
-        let mut add_flat = |corners: &[u32], normal: DVec3, surface: Surface| {
-            let corners =
-                corners.iter().map(|&corner| DVec3::from_array(self.vertices[corner as usize]));
-            let (mut min, mut max) = (DVec3::INFINITY, DVec3::NEG_INFINITY);
-            for corner in corners.clone() {
-                (min, max) = (min.min(corner), max.max(corner));
-            }
-            let blur = 8.0 * f64::EPSILON * (max.abs().max(min.abs()).max(point.abs()));
-            if point.cmpge(min - blur).all() && point.cmple(max + blur).all() {
-                let corner = corners.clone().next().expect("a corner");
-                let height = normal.dot(point - corner).abs();
-                if height <= blur.max_element() {
-                    surfaces.push(surface);
-                }
-            }
-        };
-        for triangle in &self.triangles {
-            let corners = triangle.vertices.map(|v| DVec3::from_array(self.vertices[v as usize]));
-            let normal = triangle_normal(corners);
-            add_flat(&triangle.vertices, normal, Surface(triangle.rank));
-        }
-        for face in &self.coplanars {
-            let normal = DVec3::from_array(self.planes[face.plane.index()].normal);
-            add_flat(&face.vertices, normal, face.plane.surface());
-        }
-        for face in &self.quadrangles {
-            let normal = DVec3::from_array(self.planes[face.plane.index()].normal);
-            add_flat(&face.vertices, normal, face.plane.surface());
-        }
-        for sphere in &self.spheres {
-            let from_center = point - DVec3::from_array(sphere.center);
-            let blur = 8.0 * f64::EPSILON * (sphere.radius + point.abs().max_element());
-            if (from_center.length() - sphere.radius).abs() <= blur {
-                surfaces.push(Surface(sphere.surface));
-            }
-        }
-        surfaces.sort_unstable_by_key(|surface| surface.0);
-        surfaces.dedup();
-        surfaces
-    }
 }
 
 /// A prepared scene whose every index, bound and number has been checked.
@@ -816,21 +555,8 @@ impl<B: AsRef<[u8]>> PreparedScene<B> {
             let offset = section.offset as usize;
             &data[offset..offset + section.count as usize * size]
         });
-        let mut next = || sections.next().expect("as many as there are");
-        View {
-            header,
-            nodes: bytemuck::cast_slice(next()),
-            items: bytemuck::cast_slice(next()),
-            vertices: bytemuck::cast_slice(next()),
-            triangles: bytemuck::cast_slice(next()),
-            coplanars: bytemuck::cast_slice(next()),
-            quadrangles: bytemuck::cast_slice(next()),
-            spheres: bytemuck::cast_slice(next()),
-            planes: bytemuck::cast_slice(next()),
-            materials: bytemuck::cast_slice(next()),
-            lights: bytemuck::cast_slice(next()),
-            touches: bytemuck::cast_slice(next()),
-        }
+        let sections = std::array::from_fn(|_| sections.next().expect("as many as there are"));
+        View { header, sections: Sections::from_bytes(sections) }
     }
 }
 
@@ -844,7 +570,8 @@ fn check(view: &View<'_>) -> Result<(), &'static str> {
     for vector in [camera.eye, camera.top_left, camera.right, camera.down] {
         ensure(finite(&vector), "the camera")?;
     }
-    ensure(finite(&header.background) && finite(&header.ambient), "a colour")?;
+    let lighting = &header.lighting;
+    ensure(finite(&lighting.background) && finite(&lighting.ambient), "a colour")?;
     let is_scale = |x: f64| x.is_normal() && x > 0.0 && (1.0 / x).is_normal();
     ensure(is_scale(header.scale) && is_scale(header.frame.scale), "a scale")?;
     ensure(finite(&header.frame.origin), "the frame")?;
@@ -873,6 +600,7 @@ fn check(view: &View<'_>) -> Result<(), &'static str> {
             Kind::Coplanar => view.coplanars.len(),
             Kind::Quadrangle => view.quadrangles.len(),
             Kind::Sphere => view.spheres.len(),
+            Kind::Solid => view.solids.len(),
         };
         ensure(item.index() < count, "an item")?;
     }
@@ -898,7 +626,25 @@ fn check(view: &View<'_>) -> Result<(), &'static str> {
     for plane in view.planes {
         ensure(finite(&plane.point) && finite(&plane.normal), "a plane")?;
     }
-    ensure(view.materials.iter().all(|material| finite(&material.color)), "a material")?;
+    for record in view.materials {
+        let numbers = [record.reflect, record.alpha, record.refract];
+        let is_share = |x: f64| (0.0..=1.0).contains(&x);
+        let whole = finite(&record.color) && finite(&numbers) && record.refract >= 0.0;
+        ensure(whole && is_share(record.reflect) && is_share(record.alpha), "a material")?;
+    }
+    for leaf in view.leaves {
+        let whole = finite(&leaf.center) && finite(&[leaf.radius]) && material(leaf.material);
+        let is_shape = leaf.is_sphere() || leaf.planes.iter().all(|&index| plane(index));
+        ensure(whole && is_shape, "a leaf")?;
+    }
+    for solid in view.solids {
+        ensure(solid.nodes().end <= view.solid_nodes.len(), "a solid")?;
+        ensure(solid.leaves().end <= view.leaves.len(), "a solid")?;
+        let leaves = view.solid_leaves(solid);
+        solid::check_tree(view.solid_nodes(solid), leaves).map_err(|()| "a solid's tree")?;
+        let last_rank = u64::from(solid.rank) + 6 * leaves.len() as u64;
+        ensure(last_rank <= Child::ITEM_LIMIT as u64, "a solid")?;
+    }
     for light in view.lights {
         ensure(finite(&light.position) && finite(&light.intensity), "a light")?;
         let end = light.touches_first as usize + light.touches_count as usize;

@@ -40,17 +40,23 @@ pub(crate) fn hit_quadrangle(
     if !is_inside(corners) {
         return None;
     }
-    let t = hit_plane(ray, point, normal).unwrap_or_else(|| hit_chord(corners));
-    let [a, b, c, d] = corners.map(|corner| corner.z);
-    Some(t.max(a.min(b).min(c.min(d))).min(a.max(b).max(c.max(d))))
+    // The plane's distance, whichever its corners are: coincident faces are met at one place.
+    Some(hit_plane(ray, point, normal).unwrap_or_else(|| hit_chord(corners)))
 }
 
 /// The distance to a plane; `None` for a ray that as good as runs along it, for which the division
 /// would give any place in the plane.
 #[inline(always)]
 pub(crate) fn hit_plane(ray: &Ray, point: DVec3, normal: DVec3) -> Option<f64> {
-    let along = normal.dot(ray.direction);
-    (along.abs() > EDGE_ON).then(|| normal.dot(point - ray.origin) / along)
+    let (distance, along) = toward_plane(ray, point, normal);
+    (along.abs() > EDGE_ON).then(|| distance / along)
+}
+
+/// How far a plane is from the ray's start, and how fast the ray goes there, both along its
+/// normal: the same for all faces in the plane.
+#[inline(always)]
+pub(crate) fn toward_plane(ray: &Ray, point: DVec3, normal: DVec3) -> (f64, f64) {
+    (normal.dot(point - ray.origin), normal.dot(ray.direction))
 }
 
 /// The distance of a quadrangle seen edge-on, by interpolation between the two edges right and

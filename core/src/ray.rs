@@ -13,6 +13,14 @@ pub(crate) struct Ray {
     pub(crate) reach: f64,
     /// The surface that it leaves: never met again at the start.
     pub(crate) leaving: Surface,
+    /// For a ray that went through a face, that face's rank: coincident faces that come later are
+    /// still ahead, at distance 0. Else [`Ray::NOTHING_AHEAD`].
+    pub(crate) after: u32,
+}
+
+impl Ray {
+    /// No face comes later than this.
+    pub(crate) const NOTHING_AHEAD: u32 = u32::MAX;
 }
 
 /// A surface, for leaving it: all faces in exactly one plane, all equal spheres, or else one face.
@@ -33,14 +41,16 @@ pub(crate) struct Hit {
     pub(crate) t: f64,
     /// The face's place among all faces of the scene.
     pub(crate) rank: u32,
-    /// Which face.
+    /// Which face, or which solid.
     pub(crate) item: Item,
+    /// Of a solid: 6 · leaf + face.
+    pub(crate) part: u32,
 }
 
 impl Hit {
     /// Nothing, up to `reach`.
     pub(crate) fn none(reach: f64) -> Self {
-        Self { t: reach, rank: u32::MAX, item: Item::NONE }
+        Self { t: reach, rank: u32::MAX, item: Item::NONE, part: 0 }
     }
 
     /// Whether a face is hit.
@@ -65,6 +75,8 @@ pub(crate) enum Kind {
     Quadrangle = 2,
     /// A sphere.
     Sphere = 3,
+    /// A constructive solid.
+    Solid = 4,
 }
 
 impl Item {
@@ -87,6 +99,7 @@ impl Item {
             1 => Some(Kind::Coplanar),
             2 => Some(Kind::Quadrangle),
             3 => Some(Kind::Sphere),
+            4 => Some(Kind::Solid),
             _ => None,
         }
     }

@@ -1,9 +1,10 @@
 //! A tile of a prepared scene into pixels.
 //!
 //! Rays travel in batches, class by class: a batch's camera rays are traced together, then the
-//! shadow rays towards each light in turn. What a sample receives is added in the order of the
-//! lights and a pixel's samples in their own order, so a pixel is a pure function of (scene,
-//! settings, pixel): the same to the bit whatever the tile, the batch, the thread or the CPU.
+//! shadow rays towards each light in turn, then all mirrored and transmitted rays of the next
+//! depth, and so on. What a sample receives is added in one order of depths and lights, and a
+//! pixel's samples in their own order, so a pixel is a pure function of (scene, settings, pixel):
+//! the same to the bit whatever the tile, the batch, the thread or the CPU.
 
 use std::ops::ControlFlow;
 
@@ -11,8 +12,8 @@ use glam::DVec3;
 
 use crate::{
     isa::Isa,
-    prepared::{Camera, PreparedScene, View},
-    ray::{Hit, Item, Kind, Ray, Surface},
+    prepared::{Camera, PlaneIndex, PreparedScene, View},
+    ray::{Hit, Kind, Ray, Surface},
     sample::Samples,
     tile::{Area, Size},
     trace::{self, trace, trace_shadows},
@@ -30,7 +31,16 @@ pub struct Settings {
     pub seed: u64,
     /// Every surface shows its plain colour, as in a scene without light.
     pub flat: bool,
+    /// A mirrored or transmitted branch whose weight in its sample is below this is not traced:
+    /// it counts as background. 0..=1.
+    pub cutoff: f64,
 }
+
+/// The cut-off where nobody chose one: a sixteenth of an 8-bit step.
+pub const DEFAULT_CUTOFF: f64 = 1.0 / 4096.0;
+
+/// The depth of the last rays that are traced; camera rays have depth 0.
+pub const DEEPEST: u32 = 64;
 
 /// A rendered tile.
 #[derive(Debug, Clone, PartialEq)]
@@ -39,6 +49,8 @@ pub struct RenderedTile {
     pub pixels: Vec<[f32; 3]>,
     /// Rays traced, of all kinds.
     pub rays: u64,
+    /// The largest sum of weights of branches that were not traced, in any sample. 0..=1.
+    pub cut: f64,
 }
 
 /// Camera rays in a batch: enough to fill the queues, few enough to stay in the cache.
@@ -59,15 +71,16 @@ pub fn render_tile<B: AsRef<[u8]>>(
     let sample_count = area.pixel_count() as u64 * samples;
     let mut sums = vec![DVec3::ZERO; area.pixel_count()];
     let mut batch = Batch::default();
-    let mut rays = 0;
+    let (mut rays, mut cut) = (0, 0.0_f64);
     let mut first = 0;
     while first < sample_count {
-        if on_progress().is_break() {
-            return None;
-        }
         let last = sample_count.min(first + BATCH as u64);
         batch.start(&view.header.camera, settings, area, first..last);
-        rays += batch.run(&view, settings.flat, isa);
+        match batch.run(&view, settings, isa, on_progress) {
+            ControlFlow::Continue(count) => rays += count,
+            ControlFlow::Break(()) => return None,
+        }
+        cut = batch.cut.iter().fold(cut, |largest, &cut| largest.max(cut));
         for (sample, color) in (first..last).zip(&batch.colors) {
             sums[(sample / samples) as usize] += *color;
         }
@@ -75,27 +88,42 @@ pub fn render_tile<B: AsRef<[u8]>>(
     }
     let count = f64::from(settings.samples);
     let pixels = sums.into_iter().map(|sum| (sum / count).to_array().map(|x| x as f32)).collect();
-    Some(RenderedTile { pixels, rays })
+    Some(RenderedTile { pixels, rays, cut })
 }
 
 /// Samples on their way, and the queues that they pass through.
 #[derive(Default)]
 struct Batch {
+    /// The rays of the current depth, and what each adds to.
     rays: Vec<Ray>,
+    branches: Vec<Branch>,
     hits: Vec<Hit>,
-    /// The samples that hit something.
     points: Vec<Point>,
     shadow_rays: Vec<Ray>,
     /// For each shadow ray, its point and what arrives if nothing is in its way.
     arrivals: Vec<(usize, DVec3)>,
-    blocked: Vec<bool>,
+    shares: Vec<f64>,
+    next_rays: Vec<Ray>,
+    next_branches: Vec<Branch>,
     /// What each sample sees.
     colors: Vec<DVec3>,
+    /// Of each sample, the weights of the branches that were not traced.
+    cut: Vec<f64>,
 }
 
-/// A place on a surface that a sample sees.
+/// A ray of the tree that a camera ray grows into.
+#[derive(Clone, Copy)]
+struct Branch {
+    sample: usize,
+    /// The product of the factors on the way from the sample.
+    weight: f64,
+}
+
+/// A place on a surface that a ray sees.
 struct Point {
     sample: usize,
+    /// What the surface's own light counts in the sample.
+    weight: f64,
     position: DVec3,
     /// Of length 1, towards the side that is seen.
     normal: DVec3,
@@ -136,35 +164,132 @@ impl Batch {
                 direction: direction / direction.length(),
                 reach: f64::INFINITY,
                 leaving: Surface::NONE,
+                after: Ray::NOTHING_AHEAD,
             });
+        }
+        self.branches.clear();
+        self.branches.extend((0..self.rays.len()).map(|sample| Branch { sample, weight: 1.0 }));
+        self.colors.clear();
+        self.colors.resize(self.rays.len(), DVec3::ZERO);
+        self.cut.clear();
+        self.cut.resize(self.rays.len(), 0.0);
+    }
+
+    /// Finds what every queued sample sees; how many rays that took. What is seen at one depth is
+    /// added before what is seen at the next, and there a mirror's before the light behind it, so
+    /// a sample's sum has one order whatever else is in the batch.
+    fn run(
+        &mut self,
+        view: &View<'_>,
+        settings: &Settings,
+        isa: Isa,
+        on_progress: &mut dyn FnMut() -> ControlFlow<()>,
+    ) -> ControlFlow<(), u64> {
+        let background = DVec3::from_array(view.header.lighting.background);
+        let mut ray_count = 0;
+        let mut depth = 0;
+        while !self.rays.is_empty() {
+            on_progress()?;
+            trace(view, isa, &self.rays, &mut self.hits);
+            ray_count += self.rays.len() as u64;
+            self.points.clear();
+            self.next_rays.clear();
+            self.next_branches.clear();
+            for index in 0..self.rays.len() {
+                let (ray, hit, branch) = (self.rays[index], self.hits[index], self.branches[index]);
+                if hit.is_some() {
+                    self.meet(view, &ray, &hit, branch, settings.cutoff, depth);
+                } else {
+                    self.colors[branch.sample] += branch.weight * background;
+                }
+            }
+            ray_count += self.light_points(view, settings.flat, isa);
+            for point in &self.points {
+                self.colors[point.sample] += point.weight * (point.color * point.light);
+            }
+            std::mem::swap(&mut self.rays, &mut self.next_rays);
+            std::mem::swap(&mut self.branches, &mut self.next_branches);
+            depth += 1;
+        }
+        for (color, cut) in self.colors.iter_mut().zip(&self.cut) {
+            *color += *cut * background;
+        }
+        ControlFlow::Continue(ray_count)
+    }
+
+    /// A ray has met a face: queues what its own light and its branches need.
+    fn meet(
+        &mut self,
+        view: &View<'_>,
+        ray: &Ray,
+        hit: &Hit,
+        Branch { sample, weight }: Branch,
+        cutoff: f64,
+        depth: u32,
+    ) {
+        let position = ray.origin + hit.t * ray.direction;
+        let outward = face_normal(view, hit, position);
+        let is_front = outward.dot(ray.direction) <= 0.0;
+        let normal = if is_front { outward } else { -outward };
+        let surface = trace::surface(view, hit.item, hit.part);
+        let material = &view.materials[trace::material(view, hit.item, hit.part) as usize];
+        let (reflect, alpha) = (material.reflect, material.alpha);
+        if reflect < 1.0 && alpha > 0.0 {
+            self.points.push(Point {
+                sample,
+                weight: weight * ((1.0 - reflect) * alpha),
+                position,
+                normal,
+                surface,
+                color: DVec3::from_array(material.color),
+                light: DVec3::from_array(view.header.lighting.ambient),
+            });
+        }
+        if view.header.features.has_branches == 0 {
+            return;
+        }
+        let mut follow = |direction: DVec3, after: u32, weight: f64| {
+            if weight < cutoff || depth == DEEPEST {
+                self.cut[sample] += weight;
+                return;
+            }
+            self.next_rays.push(Ray {
+                origin: position,
+                direction,
+                reach: f64::INFINITY,
+                leaving: surface,
+                after,
+            });
+            self.next_branches.push(Branch { sample, weight });
+        };
+        let cosine = -normal.dot(ray.direction);
+        let mirrored = mirror(ray.direction, normal, cosine);
+        if reflect > 0.0 {
+            follow(mirrored, Ray::NOTHING_AHEAD, weight * reflect);
+        }
+        if reflect < 1.0 && alpha < 1.0 {
+            let weight = weight * ((1.0 - reflect) * (1.0 - alpha));
+            let ratio = if is_front { material.refract } else { 1.0 / material.refract };
+            let is_straight = material.refract == 0.0 || material.refract == 1.0;
+            let bent = if is_straight {
+                Some(ray.direction)
+            } else {
+                refract(ray.direction, normal, cosine, ratio)
+            };
+            match bent {
+                Some(direction) => follow(direction, hit.rank, weight),
+                None => follow(mirrored, Ray::NOTHING_AHEAD, weight), // Total reflection.
+            }
         }
     }
 
-    /// Finds what every queued sample sees; how many rays that took.
-    fn run(&mut self, view: &View<'_>, flat: bool, isa: Isa) -> u64 {
-        trace(view, isa, &self.rays, &mut self.hits);
-        let mut ray_count = self.rays.len() as u64;
-        self.colors.clear();
-        self.colors.resize(self.rays.len(), DVec3::from_array(view.header.background));
-        self.points.clear();
-        for (sample, (ray, hit)) in self.rays.iter().zip(&self.hits).enumerate() {
-            if hit.is_some() {
-                self.points.push(point(view, sample, ray, hit));
-            }
+    /// Finds the light that the points receive; how many rays that took.
+    fn light_points(&mut self, view: &View<'_>, flat: bool, isa: Isa) -> u64 {
+        if flat || view.header.features.is_lit == 0 {
+            self.points.iter_mut().for_each(|point| point.light = DVec3::ONE);
+            return 0;
         }
-        if flat || view.header.is_lit == 0 {
-            for point in &mut self.points {
-                point.light = DVec3::ONE;
-            }
-        } else {
-            for index in 0..view.lights.len() {
-                ray_count += self.light(view, index, isa);
-            }
-        }
-        for point in &self.points {
-            self.colors[point.sample] = point.color * point.light;
-        }
-        ray_count
+        (0..view.lights.len()).map(|index| self.light(view, index, isa)).sum()
     }
 
     /// Adds what light `index` gives each point; how many rays that took.
@@ -184,57 +309,59 @@ impl Batch {
                     direction: to_light / distance,
                     reach: distance,
                     leaving: point.surface,
+                    after: Ray::NOTHING_AHEAD,
                 });
             }
         }
-        trace_shadows(view, isa, light, &self.shadow_rays, &mut self.blocked);
-        for (&(point, arrival), &is_blocked) in self.arrivals.iter().zip(&self.blocked) {
-            if !is_blocked {
-                self.points[point].light += arrival;
-            }
+        trace_shadows(view, isa, light, &self.shadow_rays, &mut self.shares);
+        for (&(point, arrival), &share) in self.arrivals.iter().zip(&self.shares) {
+            self.points[point].light += share * arrival;
         }
         self.shadow_rays.len() as u64
     }
 }
 
-/// The place that a ray hit.
-fn point(view: &View<'_>, sample: usize, ray: &Ray, hit: &Hit) -> Point {
-    let position = ray.origin + hit.t * ray.direction;
-    let (normal, material) = face(view, hit.item, position);
-    let normal = if normal.dot(ray.direction) > 0.0 { -normal } else { normal };
-    Point {
-        sample,
-        position,
-        normal,
-        surface: trace::surface(view, hit.item),
-        color: DVec3::from_array(view.materials[material as usize].color),
-        light: DVec3::from_array(view.header.ambient),
-    }
+/// The direction of mirrored light; `cosine` is that between the normal and where it came from.
+fn mirror(direction: DVec3, normal: DVec3, cosine: f64) -> DVec3 {
+    let mirrored = direction + 2.0 * cosine * normal;
+    mirrored / mirrored.length()
 }
 
-/// The unit normal of a face at a place on it, towards its front, and its material.
-fn face(view: &View<'_>, item: Item, position: DVec3) -> (DVec3, u32) {
-    let index = item.index();
-    match item.kind().expect("a checked item") {
+/// The direction of light behind a face by Snell's law with n1/n2 = `ratio`; `None` on total
+/// reflection. The sine is taken as (1 - c)(1 + c), which keeps its digits near the normal.
+fn refract(direction: DVec3, normal: DVec3, cosine: f64, ratio: f64) -> Option<DVec3> {
+    let square = 1.0 - ratio * ratio * ((1.0 - cosine) * (1.0 + cosine));
+    (square >= 0.0).then(|| {
+        let bent = ratio * direction + (ratio * cosine - square.sqrt()) * normal;
+        bent / bent.length()
+    })
+}
+
+/// The unit normal towards the front of what a ray hit.
+fn face_normal(view: &View<'_>, hit: &Hit, position: DVec3) -> DVec3 {
+    let of_plane =
+        |plane: PlaneIndex| DVec3::from_array(view.planes[plane.index()].normal) * plane.sign();
+    let of_sphere = |center: [f64; 3]| {
+        let outward = position - DVec3::from_array(center);
+        outward / outward.length()
+    };
+    let index = hit.item.index();
+    match hit.item.kind().expect("a checked item") {
         Kind::Triangle => {
-            let face = &view.triangles[index];
-            let corners = view.corners(&face.vertices).map(|&corner| DVec3::from_array(corner));
-            (triangle_normal(corners), face.material)
+            let corners = view.corners(&view.triangles[index].vertices);
+            triangle_normal(corners.map(|&corner| DVec3::from_array(corner)))
         }
-        Kind::Coplanar => {
-            let face = &view.coplanars[index];
-            let normal = view.planes[face.plane.index()].normal;
-            (DVec3::from_array(normal) * face.plane.sign(), face.material)
-        }
-        Kind::Quadrangle => {
-            let face = &view.quadrangles[index];
-            let normal = view.planes[face.plane.index()].normal;
-            (DVec3::from_array(normal) * face.plane.sign(), face.material)
-        }
-        Kind::Sphere => {
-            let sphere = &view.spheres[index];
-            let outward = position - DVec3::from_array(sphere.center);
-            (outward / outward.length(), sphere.material)
+        Kind::Coplanar => of_plane(view.coplanars[index].plane),
+        Kind::Quadrangle => of_plane(view.quadrangles[index].plane),
+        Kind::Sphere => of_sphere(view.spheres[index].center),
+        Kind::Solid => {
+            let leaf = &view.solid_leaves(&view.solids[index])[hit.part as usize / 6];
+            let outward = if leaf.is_sphere() {
+                of_sphere(leaf.center)
+            } else {
+                of_plane(leaf.planes[hit.part as usize % 6])
+            };
+            if leaf.is_turned == 1 { -outward } else { outward }
         }
     }
 }

@@ -1,4 +1,4 @@
-//! Batches of rays through the hierarchy: the nearest face, or whether anything is in the way.
+//! Batches of rays through the hierarchy: the nearest face, or what reaches the other end.
 //!
 //! Boxes are filtered in f32, faces decided in f64. The nearest hit is the smallest (t, rank), so
 //! it depends neither on the tree nor on the instruction set.
@@ -9,8 +9,9 @@ use crate::{
     isa::Isa,
     node::{BoxKernel, BoxRay, Child, ScalarBoxes},
     prepared::{LightRecord, PreparedScene, View},
-    quadrangle::{hit_plane, hit_quadrangle},
+    quadrangle::{hit_plane, hit_quadrangle, is_inside},
     ray::{Hit, Item, Kind, Ray, Shear, Surface},
+    solid::Scratch,
     sphere::{hit_sphere, hit_sphere_again},
     triangle::hit_triangle,
 };
@@ -21,91 +22,130 @@ const STACK: usize = 7 * crate::bvh::MOST_LEVELS + 8;
 /// Finds what each ray meets first.
 pub(crate) fn trace(view: &View<'_>, isa: Isa, rays: &[Ray], hits: &mut Vec<Hit>) {
     hits.clear();
-    let mut push = |hit| hits.push(hit);
-    match isa {
-        Isa::Scalar => trace_all::<ScalarBoxes>(view, rays, &mut push),
-        #[cfg(target_arch = "x86_64")]
-        Isa::Sse2 => trace_all::<crate::node::x86::Sse2Boxes>(view, rays, &mut push),
-        #[cfg(target_arch = "x86_64")]
-        #[expect(unsafe_code, reason = "a function compiled for AVX2")]
-        Isa::Avx2 => {
-            assert!(isa.is_supported());
-            // SAFETY: this CPU has AVX2, asserted just above.
-            unsafe { trace_avx2(view, rays, &mut push) }
-        }
-        #[cfg(not(target_arch = "x86_64"))]
-        Isa::Sse2 | Isa::Avx2 => trace_all::<ScalarBoxes>(view, rays, &mut push),
-    }
+    dispatch(view, isa, &mut Trace { rays, hits });
 }
 
-/// Finds which rays, each running to `light`, have a face in their way.
+/// Finds which share of its light each ray, running to `light`, lets through: 0..=1.
 pub(crate) fn trace_shadows(
     view: &View<'_>,
     isa: Isa,
     light: &LightRecord,
     rays: &[Ray],
-    blocked: &mut Vec<bool>,
+    shares: &mut Vec<f64>,
 ) {
-    blocked.clear();
+    shares.clear();
     let touches = view.touches(light);
-    let mut push = |is_blocked| blocked.push(is_blocked);
+    if view.header.features.has_clear_shadows == 0 {
+        dispatch(view, isa, &mut Shadows { rays, touches, shares });
+    } else {
+        dispatch(view, isa, &mut ClearShadows { rays, touches, shares });
+    }
+}
+
+/// Work on a batch of rays, the same for every instruction set.
+trait Batch {
+    fn run<K: BoxKernel>(&mut self, view: &View<'_>);
+}
+
+/// Runs a batch compiled for an instruction set, which must be supported.
+fn dispatch(view: &View<'_>, isa: Isa, batch: &mut impl Batch) {
+    assert!(isa.is_supported());
     match isa {
-        Isa::Scalar => shadow_all::<ScalarBoxes>(view, touches, rays, &mut push),
+        Isa::Scalar => batch.run::<ScalarBoxes>(view),
         #[cfg(target_arch = "x86_64")]
-        Isa::Sse2 => {
-            shadow_all::<crate::node::x86::Sse2Boxes>(view, touches, rays, &mut push);
-        }
+        Isa::Sse2 => batch.run::<crate::node::x86::Sse2Boxes>(view),
         #[cfg(target_arch = "x86_64")]
         #[expect(unsafe_code, reason = "a function compiled for AVX2")]
         Isa::Avx2 => {
-            assert!(isa.is_supported());
             // SAFETY: this CPU has AVX2, asserted just above.
-            unsafe { shadow_avx2(view, touches, rays, &mut push) }
+            unsafe { run_avx2(view, batch) }
         }
         #[cfg(not(target_arch = "x86_64"))]
-        Isa::Sse2 | Isa::Avx2 => shadow_all::<ScalarBoxes>(view, touches, rays, &mut push),
+        Isa::Sse2 | Isa::Avx2 => unreachable!("no other machine supports them"),
     }
 }
 
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx2")]
-fn trace_avx2(view: &View<'_>, rays: &[Ray], push: &mut impl FnMut(Hit)) {
-    trace_all::<crate::node::x86::Avx2Boxes>(view, rays, push);
+fn run_avx2(view: &View<'_>, batch: &mut impl Batch) {
+    batch.run::<crate::node::x86::Avx2Boxes>(view);
 }
 
-#[cfg(target_arch = "x86_64")]
-#[target_feature(enable = "avx2")]
-fn shadow_avx2(view: &View<'_>, touches: &[Surface], rays: &[Ray], push: &mut impl FnMut(bool)) {
-    shadow_all::<crate::node::x86::Avx2Boxes>(view, touches, rays, push);
+struct Trace<'a> {
+    rays: &'a [Ray],
+    hits: &'a mut Vec<Hit>,
 }
 
-#[inline(always)]
-fn trace_all<K: BoxKernel>(view: &View<'_>, rays: &[Ray], push: &mut impl FnMut(Hit)) {
-    for ray in rays {
-        let mut nearest = Nearest::new(ray);
-        visit::<K>(view, ray, |item| {
-            nearest.meet(view, item);
-            Step::On(nearest.hit.t)
-        });
-        push(nearest.hit);
+impl Batch for Trace<'_> {
+    #[inline(always)]
+    fn run<K: BoxKernel>(&mut self, view: &View<'_>) {
+        let mut scratch = Scratch::default();
+        for ray in self.rays {
+            let mut nearest = Nearest::new(ray);
+            visit::<K>(view, ray, |item| {
+                nearest.meet(view, item, &mut scratch);
+                Step::On(nearest.hit.t)
+            });
+            self.hits.push(nearest.hit);
+        }
     }
 }
 
-#[inline(always)]
-fn shadow_all<K: BoxKernel>(
-    view: &View<'_>,
-    touches: &[Surface],
-    rays: &[Ray],
-    push: &mut impl FnMut(bool),
-) {
-    for ray in rays {
-        let shear = Shear::new(ray.origin, ray.direction);
-        let mut is_blocked = false;
-        visit::<K>(view, ray, |item| {
-            is_blocked = blocks(view, ray, &shear, touches, item);
-            if is_blocked { Step::Enough } else { Step::On(ray.reach) }
-        });
-        push(is_blocked);
+/// Nothing lets light through: the first face decides.
+struct Shadows<'a> {
+    rays: &'a [Ray],
+    touches: &'a [Surface],
+    shares: &'a mut Vec<f64>,
+}
+
+impl Batch for Shadows<'_> {
+    #[inline(always)]
+    fn run<K: BoxKernel>(&mut self, view: &View<'_>) {
+        let mut scratch = Scratch::default();
+        for ray in self.rays {
+            let shear = Shear::new(ray.origin, ray.direction);
+            let mut is_blocked = false;
+            visit::<K>(view, ray, |item| {
+                between(view, ray, &shear, self.touches, item, &mut scratch, |_, _| {
+                    is_blocked = true;
+                });
+                if is_blocked { Step::Enough } else { Step::On(ray.reach) }
+            });
+            self.shares.push(if is_blocked { 0.0 } else { 1.0 });
+        }
+    }
+}
+
+/// Every face counts.
+struct ClearShadows<'a> {
+    rays: &'a [Ray],
+    touches: &'a [Surface],
+    shares: &'a mut Vec<f64>,
+}
+
+impl Batch for ClearShadows<'_> {
+    #[inline(always)]
+    fn run<K: BoxKernel>(&mut self, view: &View<'_>) {
+        let mut scratch = Scratch::default();
+        let mut crossed: Vec<(u32, f64)> = Vec::new();
+        for ray in self.rays {
+            let shear = Shear::new(ray.origin, ray.direction);
+            crossed.clear();
+            let mut is_blocked = false;
+            visit::<K>(view, ray, |item| {
+                between(view, ray, &shear, self.touches, item, &mut scratch, |rank, part| {
+                    let material = &view.materials[material(view, item, part) as usize];
+                    let share = material.clearness();
+                    is_blocked |= share == 0.0;
+                    crossed.push((rank, share));
+                });
+                if is_blocked { Step::Enough } else { Step::On(ray.reach) }
+            });
+            // In an order that does not depend on the tree, for products round.
+            crossed.sort_unstable_by_key(|&(rank, _)| rank);
+            let share = crossed.iter().fold(1.0, |product, (_, share)| product * share);
+            self.shares.push(if is_blocked { 0.0 } else { share });
+        }
     }
 }
 
@@ -177,18 +217,27 @@ impl<'a> Nearest<'a> {
     }
 
     #[inline(always)]
-    fn meet(&mut self, view: &View<'_>, item: Item) {
-        let Some((t, rank)) = meet(view, self.ray, &self.shear, item) else { return };
+    fn meet(&mut self, view: &View<'_>, item: Item, scratch: &mut Scratch) {
+        let Some((t, rank, part)) = meet(view, self.ray, &self.shear, item, scratch) else {
+            return;
+        };
         if t < self.hit.t || (t == self.hit.t && rank < self.hit.rank && self.hit.is_some()) {
-            self.hit = Hit { t, rank, item };
+            self.hit = Hit { t, rank, item, part };
         }
     }
 }
 
-/// The distance, above 0, at which the ray first crosses a face other than the one that it
-/// leaves, and the face's rank.
+/// The distance at which the ray first crosses a face other than the one that it leaves, the
+/// face's rank, and which part of a solid it is. The distance is above 0, or 0 for a face that
+/// coincides with one that the ray went through and comes later.
 #[inline(always)]
-fn meet(view: &View<'_>, ray: &Ray, shear: &Shear, item: Item) -> Option<(f64, u32)> {
+fn meet(
+    view: &View<'_>,
+    ray: &Ray,
+    shear: &Shear,
+    item: Item,
+    scratch: &mut Scratch,
+) -> Option<(f64, u32, u32)> {
     let index = item.index();
     let (t, rank) = match item.kind()? {
         Kind::Triangle => {
@@ -202,11 +251,15 @@ fn meet(view: &View<'_>, ray: &Ray, shear: &Shear, item: Item) -> Option<(f64, u
         }
         Kind::Coplanar => {
             let face = &view.coplanars[index];
-            if ray.leaving == face.plane.surface() {
+            let is_left = ray.leaving == face.plane.surface();
+            if is_left && face.rank <= ray.after {
                 return None;
             }
             let corners = view.corners(&face.vertices).map(|corner| shear.project(corner));
             let t = hit_triangle(corners)?;
+            if is_left {
+                return Some((0.0, face.rank, 0));
+            }
             // The plane's distance, not this triangle's: coincident faces are met at one place.
             let plane = &view.planes[face.plane.index()];
             let [point, normal] = [plane.point, plane.normal].map(DVec3::from_array);
@@ -214,10 +267,14 @@ fn meet(view: &View<'_>, ray: &Ray, shear: &Shear, item: Item) -> Option<(f64, u
         }
         Kind::Quadrangle => {
             let face = &view.quadrangles[index];
-            if ray.leaving == face.plane.surface() {
+            let is_left = ray.leaving == face.plane.surface();
+            if is_left && face.rank <= ray.after {
                 return None;
             }
             let corners = view.corners(&face.vertices).map(|corner| shear.project(corner));
+            if is_left {
+                return is_inside(&corners).then_some((0.0, face.rank, 0));
+            }
             let plane = &view.planes[face.plane.index()];
             let [point, normal] = [plane.point, plane.normal].map(DVec3::from_array);
             (hit_quadrangle(ray, &corners, point, normal)?, face.rank)
@@ -226,6 +283,9 @@ fn meet(view: &View<'_>, ray: &Ray, shear: &Shear, item: Item) -> Option<(f64, u
             let sphere = &view.spheres[index];
             let center = DVec3::from_array(sphere.center);
             let t = if ray.leaving == Surface(sphere.surface) {
+                if sphere.rank > ray.after {
+                    return Some((0.0, sphere.rank, 0));
+                }
                 hit_sphere_again(ray, center)
             } else {
                 let [near, far] = hit_sphere(ray, center, sphere.radius)?;
@@ -233,40 +293,86 @@ fn meet(view: &View<'_>, ray: &Ray, shear: &Shear, item: Item) -> Option<(f64, u
             };
             (t, sphere.rank)
         }
+        Kind::Solid => return meet_solid(view, ray, index, scratch),
     };
-    (t > 0.0).then_some((t, rank))
+    (t > 0.0).then_some((t, rank, 0))
 }
 
-/// Whether a face crosses the ray strictly between its start and its end, which is a light that
-/// the surfaces `touches` contain.
-#[inline(always)]
-fn blocks(view: &View<'_>, ray: &Ray, shear: &Shear, touches: &[Surface], item: Item) -> bool {
-    if !touches.is_empty() {
-        let index = item.index();
-        let surface = match item.kind() {
-            Some(Kind::Triangle) => Surface(view.triangles[index].rank),
-            Some(Kind::Coplanar) => view.coplanars[index].plane.surface(),
-            Some(Kind::Quadrangle) => view.quadrangles[index].plane.surface(),
-            Some(Kind::Sphere) => Surface(view.spheres[index].surface),
-            None => return false,
+#[inline(never)]
+fn meet_solid(
+    view: &View<'_>,
+    ray: &Ray,
+    index: usize,
+    scratch: &mut Scratch,
+) -> Option<(f64, u32, u32)> {
+    let solid = &view.solids[index];
+    scratch.cross(view, solid, ray, &[]);
+    scratch.crossings.iter().find_map(|crossing| {
+        let rank = solid.rank + crossing.part;
+        let is_met = crossing.t > 0.0 || {
+            let leaf = &view.solid_leaves(solid)[crossing.part as usize / 6];
+            rank > ray.after && leaf_surface(leaf, crossing.part % 6) == ray.leaving
         };
-        if touches.contains(&surface) {
-            if item.kind() != Some(Kind::Sphere) || ray.leaving == surface {
-                return false;
+        is_met.then_some((crossing.t, rank, crossing.part))
+    })
+}
+
+/// Calls `cross` with the rank and the part of every crossing of a face strictly between the
+/// ray's start and its end, which is a light that the surfaces `touches` contain.
+#[inline(always)]
+fn between(
+    view: &View<'_>,
+    ray: &Ray,
+    shear: &Shear,
+    touches: &[Surface],
+    item: Item,
+    scratch: &mut Scratch,
+    mut cross: impl FnMut(u32, u32),
+) {
+    let index = item.index();
+    match item.kind() {
+        Some(Kind::Solid) => {
+            let solid = &view.solids[index];
+            scratch.cross(view, solid, ray, touches);
+            for crossing in &scratch.crossings {
+                if crossing.t > 0.0 && crossing.t < ray.reach {
+                    cross(solid.rank + crossing.part, crossing.part);
+                }
             }
-            // The sphere is crossed where the light is, and perhaps once more on the way.
-            let center = DVec3::from_array(view.spheres[index].center);
-            let light = Ray {
-                origin: ray.origin + ray.reach * ray.direction,
-                direction: -ray.direction,
-                reach: ray.reach,
-                leaving: surface,
+        }
+        Some(Kind::Sphere) => {
+            let sphere = &view.spheres[index];
+            let center = DVec3::from_array(sphere.center);
+            let surface = Surface(sphere.surface);
+            let is_inner = |&t: &f64| t > 0.0 && t < ray.reach;
+            let ends = if ray.leaving == surface {
+                // Both ends on the sphere: nothing between.
+                let again = hit_sphere_again(ray, center);
+                [again, if touches.contains(&surface) { again } else { f64::INFINITY }]
+            } else if touches.contains(&surface) {
+                let back = Ray { origin: ray.origin + ray.reach * ray.direction, ..*ray };
+                [ray.reach + hit_sphere_again(&back, center), f64::INFINITY]
+            } else {
+                hit_sphere(ray, center, sphere.radius).unwrap_or([f64::INFINITY; 2])
             };
-            let t = hit_sphere_again(&light, center);
-            return t > 0.0 && t < ray.reach;
+            if ray.leaving == surface && touches.contains(&surface) {
+                return;
+            }
+            for _ in ends.iter().filter(|t| is_inner(t)) {
+                cross(sphere.rank, 0);
+            }
+        }
+        _ => {
+            if !touches.is_empty() && touches.contains(&surface(view, item, 0)) {
+                return;
+            }
+            if let Some((t, rank, _)) = meet(view, ray, shear, item, scratch)
+                && t < ray.reach
+            {
+                cross(rank, 0);
+            }
         }
     }
-    meet(view, ray, shear, item).is_some_and(|(t, _)| t < ray.reach)
 }
 
 /// A ray to try on a prepared scene.
@@ -276,9 +382,9 @@ pub struct Probe {
     pub origin: DVec3,
     /// Where it goes; of length 1 within rounding.
     pub direction: DVec3,
-    /// The primitive on whose surface it starts: that crossing is not met, nor any face in
+    /// The primitive and its face on which it starts: that crossing is not met, nor any face in
     /// exactly the same plane.
-    pub leaving: Option<u32>,
+    pub leaving: Option<(u32, u32)>,
 }
 
 /// What a [`Probe`] met.
@@ -288,6 +394,9 @@ pub struct ProbeHit {
     pub t: f64,
     /// The place of the primitive in the file, from 0.
     pub primitive: u32,
+    /// Which of its faces: of a parallelepiped 0..6, of a mesh the triangle, of a solid
+    /// 6 · leaf + the leaf's face.
+    pub face: u32,
 }
 
 impl<B: AsRef<[u8]>> PreparedScene<B> {
@@ -303,68 +412,105 @@ impl<B: AsRef<[u8]>> PreparedScene<B> {
     /// The same without the hierarchy: every face is tried.
     pub fn probe_all_faces(&self, probes: &[Probe]) -> Vec<Option<ProbeHit>> {
         let view = self.view();
-        let try_all = |probe: &Probe| {
+        let mut scratch = Scratch::default();
+        let mut try_all = |probe: &Probe| {
             let ray = to_ray(&view, probe);
             let mut nearest = Nearest::new(&ray);
-            view.items.iter().for_each(|&item| nearest.meet(&view, item));
+            view.items.iter().for_each(|&item| nearest.meet(&view, item, &mut scratch));
             from_hit(&view, &nearest.hit)
         };
-        probes.iter().map(try_all).collect()
+        probes.iter().map(&mut try_all).collect()
     }
 
     /// How many faces each probe crosses.
     pub fn count_crossings(&self, probes: &[Probe]) -> Vec<u32> {
         let view = self.view();
-        let count = |probe: &Probe| {
+        let mut scratch = Scratch::default();
+        let mut count = |probe: &Probe| {
             let ray = to_ray(&view, probe);
             let shear = Shear::new(ray.origin, ray.direction);
             let mut crossings = 0;
             visit::<ScalarBoxes>(&view, &ray, |item| {
-                crossings += u32::from(meet(&view, &ray, &shear, item).is_some());
+                between(&view, &ray, &shear, &[], item, &mut scratch, |_, _| crossings += 1);
                 Step::On(ray.reach)
             });
             crossings
         };
-        probes.iter().map(count).collect()
+        probes.iter().map(&mut count).collect()
     }
 }
 
 fn to_ray(view: &View<'_>, probe: &Probe) -> Ray {
-    let leaving = probe.leaving.map_or(Surface::NONE, |primitive| {
-        let item = view.items.iter().find(|&&item| rank(view, item) == primitive);
-        item.map_or(Surface::NONE, |&item| surface(view, item))
+    let leaving = probe.leaving.and_then(|(primitive, face)| {
+        let first = view.first_ranks.get(primitive as usize).copied().unwrap_or(primitive);
+        let rank = first + face;
+        view.items.iter().find_map(|&item| match item.kind() {
+            Some(Kind::Solid) => {
+                let solid = &view.solids[item.index()];
+                let part = rank.checked_sub(solid.rank)?;
+                let is_its = (part as usize) < 6 * view.solid_leaves(solid).len();
+                is_its.then(|| surface(view, item, part))
+            }
+            _ => (flat_rank(view, item) == rank).then(|| surface(view, item, 0)),
+        })
     });
     Ray {
         origin: probe.origin * view.header.scale,
         direction: probe.direction,
         reach: f64::INFINITY,
-        leaving,
+        leaving: leaving.unwrap_or(Surface::NONE),
+        after: Ray::NOTHING_AHEAD,
     }
 }
 
 fn from_hit(view: &View<'_>, hit: &Hit) -> Option<ProbeHit> {
-    hit.is_some().then(|| ProbeHit { t: hit.t / view.header.scale, primitive: hit.rank })
+    hit.is_some().then(|| {
+        let (primitive, face) = view.primitive_and_face(hit.rank);
+        ProbeHit { t: hit.t / view.header.scale, primitive, face }
+    })
 }
 
-fn rank(view: &View<'_>, item: Item) -> u32 {
+/// The rank of a face that is no solid's.
+fn flat_rank(view: &View<'_>, item: Item) -> u32 {
     let index = item.index();
     match item.kind() {
         Some(Kind::Triangle) => view.triangles[index].rank,
         Some(Kind::Coplanar) => view.coplanars[index].rank,
         Some(Kind::Quadrangle) => view.quadrangles[index].rank,
         Some(Kind::Sphere) => view.spheres[index].rank,
-        None => u32::MAX,
+        Some(Kind::Solid) | None => u32::MAX,
     }
 }
 
-/// The surface that a face belongs to.
-pub(crate) fn surface(view: &View<'_>, item: Item) -> Surface {
+/// The surface that a face, or a part of a solid, belongs to.
+pub(crate) fn surface(view: &View<'_>, item: Item, part: u32) -> Surface {
     let index = item.index();
     match item.kind() {
         Some(Kind::Triangle) => Surface(view.triangles[index].rank),
         Some(Kind::Coplanar) => view.coplanars[index].plane.surface(),
         Some(Kind::Quadrangle) => view.quadrangles[index].plane.surface(),
         Some(Kind::Sphere) => Surface(view.spheres[index].surface),
+        Some(Kind::Solid) => {
+            let leaf = &view.solid_leaves(&view.solids[index])[part as usize / 6];
+            leaf_surface(leaf, part % 6)
+        }
         None => Surface::NONE,
+    }
+}
+
+fn leaf_surface(leaf: &crate::prepared::LeafRecord, face: u32) -> Surface {
+    if leaf.is_sphere() { Surface(leaf.surface) } else { leaf.planes[face as usize].surface() }
+}
+
+/// The material of a face, or of a part of a solid.
+pub(crate) fn material(view: &View<'_>, item: Item, part: u32) -> u32 {
+    let index = item.index();
+    match item.kind() {
+        Some(Kind::Triangle) => view.triangles[index].material,
+        Some(Kind::Coplanar) => view.coplanars[index].material,
+        Some(Kind::Quadrangle) => view.quadrangles[index].material,
+        Some(Kind::Sphere) => view.spheres[index].material,
+        Some(Kind::Solid) => view.solid_leaves(&view.solids[index])[part as usize / 6].material,
+        None => 0,
     }
 }

@@ -3,8 +3,9 @@
 use glam::DVec3;
 use rtfarm_core::{
     isa::Isa,
-    prepared::{PreparedBytes, PreparedScene, prepare},
-    scene::Scene,
+    prepare::prepare,
+    prepared::{PreparedBytes, PreparedScene},
+    scene::{Parallelepiped, Scene, SolidNode},
     trace::{Probe, ProbeHit},
 };
 use rtfarm_oracle::{
@@ -27,8 +28,8 @@ fn opened(scene: &Scene) -> PreparedScene<PreparedBytes> {
     PreparedScene::open(prepare(scene).expect("a plain scene")).expect("a valid block")
 }
 
-fn flat_recipe(style: Style) -> Recipe {
-    Recipe { parallelepipeds: 0, ..Recipe::new(style) }
+fn recipe(style: Style) -> Recipe {
+    Recipe { solids: 2, ..Recipe::new(style) }
 }
 
 fn rays(scene: &Scene, seed: u64, count: usize) -> Vec<Probe> {
@@ -51,9 +52,11 @@ fn check_against_oracle(
 ) -> bool {
     let leaving = probe
         .leaving
-        .map(|primitive| Leaving { id: FaceId { primitive, face: 0 }, through: false });
+        .map(|(primitive, face)| Leaving { id: FaceId { primitive, face }, through: false });
     let truth = oracle.first_hit(probe.origin, probe.direction, leaving);
-    if truth.map(|hit| hit.id.primitive) != found.map(|hit| hit.primitive) {
+    if truth.map(|hit| (hit.id.primitive, hit.id.face))
+        != found.map(|hit| (hit.primitive, hit.face))
+    {
         let margin = oracle.miss_margin(probe.origin, probe.direction, leaving);
         let involved = [truth.map(|hit| hit.id.primitive), found.map(|hit| hit.primitive)];
         let is_quadrangle = scene.quadrangles.iter().any(|q| involved.contains(&Some(q.primitive)));
@@ -89,7 +92,25 @@ fn oracle_extent(scene: &Scene, primitive: u32) -> f64 {
     let spheres = (scene.spheres.iter())
         .filter(|sphere| sphere.primitive == primitive)
         .map(|sphere| sphere.center.abs() + sphere.radius);
-    corners.chain(spheres).map(|corner| corner.abs().max_element()).fold(0.0, f64::max)
+    let reach = |solid: &Parallelepiped| {
+        solid.edges.iter().fold(solid.corner.abs(), |reach, edge| reach + edge.abs())
+    };
+    let boxes =
+        (scene.parallelepipeds.iter()).filter(|solid| solid.primitive == primitive).map(reach);
+    let leaves = (scene.solids.iter())
+        .filter(|solid| solid.primitive == primitive)
+        .flat_map(|solid| &solid.nodes)
+        .map(|node| match node {
+            SolidNode::Sphere(sphere) => sphere.center.abs() + sphere.radius,
+            SolidNode::Parallelepiped(solid) => reach(solid),
+            SolidNode::Operation { .. } => DVec3::ZERO,
+        });
+    corners
+        .chain(spheres)
+        .chain(boxes)
+        .chain(leaves)
+        .map(|corner| corner.abs().max_element())
+        .fold(0.0, f64::max)
 }
 
 #[test]
@@ -97,7 +118,7 @@ fn the_tracer_meets_what_the_oracle_meets() {
     for style in STYLES {
         let (mut same, mut close) = (0, 0);
         for seed in 0..60 {
-            let scene = random_scene(seed, &flat_recipe(style));
+            let scene = random_scene(seed, &recipe(style));
             let (prepared, oracle) = (opened(&scene), Oracle::new(&scene));
             let probes = rays(&scene, seed, 100);
             for (probe, found) in probes.iter().zip(prepared.probe(&probes, Isa::fastest())) {
@@ -117,7 +138,7 @@ fn the_tracer_meets_what_the_oracle_meets() {
 fn a_ray_that_leaves_a_face_meets_what_the_oracle_meets() {
     for style in STYLES {
         for seed in 0..40 {
-            let scene = random_scene(seed, &flat_recipe(style));
+            let scene = random_scene(seed, &recipe(style));
             let (prepared, oracle) = (opened(&scene), Oracle::new(&scene));
             let first = rays(&scene, seed, 60);
             let mut random = Random::new(seed);
@@ -126,7 +147,11 @@ fn a_ray_that_leaves_a_face_meets_what_the_oracle_meets() {
                 let Some(hit) = hit else { continue };
                 let origin = probe.origin + hit.t * probe.direction;
                 let direction = random.direction();
-                secondary.push(Probe { origin, direction, leaving: Some(hit.primitive) });
+                secondary.push(Probe {
+                    origin,
+                    direction,
+                    leaving: Some((hit.primitive, hit.face)),
+                });
             }
             let found = prepared.probe(&secondary, Isa::fastest());
             for (probe, found) in secondary.iter().zip(found) {
@@ -141,8 +166,14 @@ fn a_ray_that_leaves_a_face_meets_what_the_oracle_meets() {
 fn the_hierarchy_finds_what_brute_force_finds_on_every_instruction_set() {
     for style in STYLES {
         for seed in 0..30 {
-            let recipe =
-                Recipe { spheres: 60, triangles: 120, quadrangles: 60, ..flat_recipe(style) };
+            let recipe = Recipe {
+                spheres: 60,
+                triangles: 120,
+                quadrangles: 60,
+                parallelepipeds: 20,
+                solids: 20,
+                ..recipe(style)
+            };
             let scene = random_scene(seed, &recipe);
             let prepared = opened(&scene);
             let probes = rays(&scene, seed, 500);
@@ -150,7 +181,7 @@ fn the_hierarchy_finds_what_brute_force_finds_on_every_instruction_set() {
             for isa in Isa::ALL.into_iter().filter(|isa| isa.is_supported()) {
                 let found = prepared.probe(&probes, isa);
                 for ((probe, brute), found) in probes.iter().zip(&brute).zip(found) {
-                    let bits = |hit: &ProbeHit| (hit.primitive, hit.t.to_bits());
+                    let bits = |hit: &ProbeHit| (hit.primitive, hit.face, hit.t.to_bits());
                     assert_eq!(
                         found.as_ref().map(bits),
                         brute.as_ref().map(bits),
@@ -164,7 +195,7 @@ fn the_hierarchy_finds_what_brute_force_finds_on_every_instruction_set() {
 
 /// A closed surface of `around` x `along` patches: alternately two triangles and one quadrangle.
 fn closed_surface(around: usize, along: usize, offset: DVec3, scale: f64) -> Scene {
-    let mut scene = random_scene(0, &Recipe { lights: 0, ..flat_recipe(Style::Plain) });
+    let mut scene = random_scene(0, &Recipe { lights: 0, ..recipe(Style::Plain) });
     (scene.spheres, scene.triangles, scene.quadrangles) = (vec![], vec![], vec![]);
     let torus = |i: usize, j: usize| {
         let turn = |k: usize, of: usize| {
@@ -222,7 +253,7 @@ fn a_closed_surface_is_crossed_an_even_number_of_times_at_edges_and_corners_too(
 
 #[test]
 fn a_scaled_scene_gives_the_same_hits_to_the_bit() {
-    let scene = random_scene(3, &flat_recipe(Style::Plain));
+    let scene = random_scene(3, &recipe(Style::Plain));
     let probes = rays(&scene, 3, 1000);
     let hits = opened(&scene).probe(&probes, Isa::fastest());
     for exponent in [-40, 40] {
@@ -240,6 +271,21 @@ fn a_scaled_scene_gives_the_same_hits_to_the_bit() {
             .quadrangles
             .iter_mut()
             .for_each(|face| face.vertices = face.vertices.map(|v| v * factor));
+        let scale_box = |solid: &mut Parallelepiped| {
+            solid.corner *= factor;
+            solid.edges = solid.edges.map(|edge| edge * factor);
+        };
+        scaled.parallelepipeds.iter_mut().for_each(scale_box);
+        for node in scaled.solids.iter_mut().flat_map(|solid| &mut solid.nodes) {
+            match node {
+                SolidNode::Sphere(sphere) => {
+                    sphere.center *= factor;
+                    sphere.radius *= factor;
+                }
+                SolidNode::Parallelepiped(solid) => scale_box(solid),
+                SolidNode::Operation { .. } => {}
+            }
+        }
         scaled.lights.iter_mut().for_each(|light| light.position *= factor);
         let viewport = scaled.viewport.as_mut().expect("a viewport");
         viewport.eye *= factor;
