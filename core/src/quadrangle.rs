@@ -40,9 +40,8 @@ pub(crate) fn hit_quadrangle(
     if !is_inside(corners) {
         return None;
     }
-    let t = hit_plane(ray, point, normal).unwrap_or_else(|| hit_chord(corners));
-    let [a, b, c, d] = corners.map(|corner| corner.z);
-    Some(t.max(a.min(b).min(c.min(d))).min(a.max(b).max(c.max(d))))
+    // The plane's distance, whichever its corners are: coincident faces are met at one place.
+    Some(hit_plane(ray, point, normal).unwrap_or_else(|| hit_chord(corners)))
 }
 
 /// The distance to a plane; `None` for a ray that as good as runs along it, for which the division
