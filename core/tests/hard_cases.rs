@@ -75,6 +75,53 @@ fn point_on_sphere(scene: &Scene, size: u32, pixel: usize, sphere: &Sphere) -> O
 }
 
 #[test]
+fn a_light_on_a_flat_surface_gives_it_nothing() {
+    // A tilted wall whose numbers are not round, as triangles, alone or two, and a quadrangle.
+    let mut random = Random::new(4);
+    for seed in 0..20 {
+        let (u, v) = (DVec3::new(2.0, 0.1, 0.3), DVec3::new(-0.2, 2.0, 0.5));
+        let nudge = random.in_cube() * 0.1;
+        let corner = |s: f64, t: f64| nudge + s * u + t * v;
+        let square = [(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)];
+        let [a, b, c, d] = square.map(|(s, t)| corner(s, t));
+        let one = [corner(-3.0, -2.0), corner(3.0, -2.0), corner(0.0, 5.0)];
+        let two = polygon(&[a, b, c], "white") + &polygon(&[a, c, d], "white");
+        let (s, t) = (random.between(-0.1, 0.1), random.between(-0.1, 0.1));
+        for (what, light, faces) in [
+            ("a triangle", corner(s, t), polygon(&one, "white")),
+            ("an edge", corner(s, s), two),
+            ("a quadrangle", corner(s, t), polygon(&[a, b, c, d], "white")),
+        ] {
+            let scene = scene(&lamp(light.x, light.y, light.z), &faces);
+            for (k, pixel) in picture(&scene, &settings(40, 40, 4)).into_iter().enumerate() {
+                assert_eq!(pixel, BLACK, "{what}, {seed}: pixel {k}");
+            }
+        }
+    }
+}
+
+#[test]
+fn a_light_on_a_sphere_gives_it_nothing_outside_or_inside() {
+    for center in [DVec3::ZERO, DVec3::new(0.1, 0.2, 4.3)] {
+        let mut random = Random::new(6);
+        for seed in 0..20 {
+            let light = center + random.direction();
+            let scene = scene(&lamp(light.x, light.y, light.z), &sphere(center, 1.0, "white"));
+            for (k, pixel) in picture(&scene, &settings(40, 40, 4)).into_iter().enumerate() {
+                assert_eq!(pixel, BLACK, "{seed}: pixel {k}");
+            }
+        }
+    }
+}
+
+#[test]
+fn a_light_at_a_point_that_a_ray_hits_gives_it_nothing() {
+    // The middle pixel's ray runs along z.
+    let scene = scene(&lamp(0.0, 0.0, 0.0), &wall(0.0, 9.0, "white"));
+    assert!(picture(&scene, &settings(41, 41, 1)).into_iter().all(|pixel| pixel == BLACK));
+}
+
+#[test]
 fn a_light_on_a_surface_still_lights_what_faces_it() {
     let lit = |light: f64| {
         let back = wall(-1.0, 9.0, "white");
