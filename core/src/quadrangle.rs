@@ -40,9 +40,8 @@ pub(crate) fn hit_quadrangle(
     if !is_inside(corners) {
         return None;
     }
-    let t = hit_plane(ray, point, normal).unwrap_or_else(|| hit_chord(corners));
-    let [a, b, c, d] = corners.map(|corner| corner.z);
-    Some(t.max(a.min(b).min(c.min(d))).min(a.max(b).max(c.max(d))))
+    // The plane's distance as it is: coincident faces, whatever their corners, are met at one place.
+    Some(hit_plane(ray, point, normal).unwrap_or_else(|| hit_chord(corners)))
 }
 
 /// The distance to a plane; `None` for a ray that as good as runs along it, for which the division
@@ -71,5 +70,7 @@ fn hit_chord(corners: &[Projected; 4]) -> f64 {
         }
     }
     let width = right.0 - left.0;
-    if width > 0.0 { (left.1 * right.0 - right.1 * left.0) / width } else { left.1 }
+    let t = if width > 0.0 { (left.1 * right.0 - right.1 * left.0) / width } else { left.1 };
+    let [a, b, c, d] = corners.map(|corner| corner.z);
+    t.max(a.min(b).min(c.min(d))).min(a.max(b).max(c.max(d)))
 }

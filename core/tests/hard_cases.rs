@@ -274,6 +274,20 @@ fn the_first_of_equal_triangles_wins_wherever_its_corners_begin() {
 }
 
 #[test]
+fn the_first_wins_of_a_quadrangle_and_triangles_over_it() {
+    for (what, [a, b, c, d]) in squares().into_iter().take(2) {
+        let quadrangle = polygon(&[a, b, c, d], "red");
+        let triangles = polygon(&[a, b, c], "green") + &polygon(&[c, d, a], "green");
+        check_first_wins(&what, &quadrangle, &triangles);
+        check_first_wins(&what, &triangles, &quadrangle);
+        // A label: smaller, inside, the other way round.
+        let middle = (a + c) / 2.0;
+        let label = [b, a, d].map(|corner| middle + (corner - middle) / 4.0);
+        check_first_wins(&what, &quadrangle, &polygon(&label, "white"));
+    }
+}
+
+#[test]
 fn of_planes_that_are_nearly_one_the_nearer_is_seen_and_shades_the_other() {
     for (near, far) in [("red", "green"), ("green", "red")] {
         let far = wall(0.0, 1.0, far);
