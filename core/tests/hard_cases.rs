@@ -274,6 +274,14 @@ fn the_first_of_equal_triangles_wins_wherever_its_corners_begin() {
 }
 
 #[test]
+fn the_first_of_equal_quadrangles_wins_wherever_its_corners_begin() {
+    for (what, [a, b, c, d]) in squares() {
+        let copies = polygon(&[b, c, d, a], "green") + &polygon(&[d, c, b, a], "white");
+        check_first_wins(&what, &polygon(&[a, b, c, d], "red"), &copies);
+    }
+}
+
+#[test]
 fn the_first_wins_of_a_quadrangle_and_triangles_over_it() {
     for (what, [a, b, c, d]) in squares().into_iter().take(2) {
         let quadrangle = polygon(&[a, b, c, d], "red");
