@@ -557,28 +557,39 @@ impl<'a> Faces<'a> {
         let mut planes = vec![FacePlane::Own; self.flat_count()];
         for group in by_plane.chunk_by(|a, b| a.0 == b.0) {
             let first = group[0].2 as usize;
-            if group.len() == 1 && first < triangles {
-                continue;
+            if group.len() > 1 || first >= triangles {
+                self.share_plane(group.iter().map(|&(_, _, face)| face as usize), &mut planes);
             }
-            let plane = self.plane_of(first);
-            let index = self.shared.len() as u32;
-            for &(_, _, face) in group {
-                let normal = plane::unit_normal(self.corners(face as usize));
-                let reversed = normal.dot(DVec3::from_array(plane.normal)) < 0.0;
-                planes[face as usize] =
-                    FacePlane::Shared(PlaneIndex(index | u32::from(reversed) << 31));
-            }
-            self.shared.push(plane);
         }
-        // Quadrangles that are flat only within rounding have planes of their own.
-        for (face, plane) in planes.iter_mut().enumerate().skip(triangles) {
-            if matches!(plane, FacePlane::Own) {
-                *plane = FacePlane::Shared(PlaneIndex(self.shared.len() as u32));
-                let record = self.plane_of(face);
-                self.shared.push(record);
-            }
+        // Quadrangles that are flat only within rounding share theirs with those of the same
+        // corners.
+        let mut by_corners: Vec<([u32; 4], u32, usize)> = (triangles..self.flat_count())
+            .filter(|&face| matches!(planes[face], FacePlane::Own))
+            .map(|face| {
+                let mut corners = [0; 4];
+                corners.copy_from_slice(&self.welded[self.corner_range(face)]);
+                corners.sort_unstable();
+                (corners, self.rank(face), face)
+            })
+            .collect();
+        by_corners.sort_unstable();
+        for group in by_corners.chunk_by(|a, b| a.0 == b.0) {
+            self.share_plane(group.iter().map(|&(_, _, face)| face), &mut planes);
         }
         self.planes = planes;
+    }
+
+    /// Gives faces one record, the plane of the first of them.
+    fn share_plane(&mut self, group: impl Iterator<Item = usize>, planes: &mut [FacePlane]) {
+        let mut group = group.peekable();
+        let plane = self.plane_of(*group.peek().expect("a group has a face"));
+        let index = self.shared.len() as u32;
+        for face in group {
+            let normal = plane::unit_normal(self.corners(face));
+            let reversed = normal.dot(DVec3::from_array(plane.normal)) < 0.0;
+            planes[face] = FacePlane::Shared(PlaneIndex(index | u32::from(reversed) << 31));
+        }
+        self.shared.push(plane);
     }
 
     /// The plane through the mean corner with Newell's normal.
