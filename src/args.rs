@@ -7,6 +7,7 @@ use rtfarm_coordinator::Wish;
 use rtfarm_core::{
     isa::{Isa, IsaError},
     picture::PictureFormat,
+    render::DEFAULT_CUTOFF,
     tile::{Size, SizeError, TileGrid},
 };
 use rtfarm_proto::Address;
@@ -58,6 +59,11 @@ pub(crate) struct PictureArgs {
     /// Show every surface in its plain colour, as in a scene without light.
     #[arg(long)]
     flat: bool,
+
+    /// Mirrored and transmitted light that counts less than this in its sample is taken for
+    /// background.
+    #[arg(long, value_name = "WEIGHT", default_value_t = DEFAULT_CUTOFF, value_parser = parse_share)]
+    cutoff: f64,
 
     /// The side of a tile in pixels; by default the one that gives about 1000 tiles.
     #[arg(long, value_name = "N", value_parser = value_parser!(u64).range(TileGrid::SIDES))]
@@ -207,6 +213,7 @@ impl PictureArgs {
             samples: self.samples,
             seed: self.seed,
             flat: self.flat,
+            cutoff: self.cutoff,
             tile_side: self.tile,
             format,
         }
@@ -259,6 +266,11 @@ fn parse_size(text: &str) -> Result<Size, String> {
     let sides = text.split_once('x').and_then(|(w, h)| Some((w.parse().ok()?, h.parse().ok()?)));
     let (width, height) = sides.ok_or("a size looks like 1280x720")?;
     Size::new(width, height).map_err(|error: SizeError| error.to_string())
+}
+
+fn parse_share(text: &str) -> Result<f64, String> {
+    let share: f64 = text.parse().map_err(|_| "a number is wanted")?;
+    if (0.0..=1.0).contains(&share) { Ok(share) } else { Err("a weight is from 0 to 1".to_owned()) }
 }
 
 fn parse_seconds(text: &str) -> Result<Duration, String> {

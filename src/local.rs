@@ -61,6 +61,7 @@ pub(crate) fn render(
             progress.send_modify(|progress| {
                 progress.tiles_done += 1;
                 progress.rays += rendered.rays;
+                progress.cut = progress.cut.max(rendered.cut);
                 done = progress.tiles_done;
             });
             let cost = TileCost { seconds, rays: rendered.rays };

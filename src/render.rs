@@ -4,7 +4,7 @@ use std::{
     fs,
     io::{self, Read, Write},
     os::unix::fs::PermissionsExt,
-    path::Path,
+    path::{Path, PathBuf},
     sync::Arc,
     time::Duration,
 };
@@ -34,23 +34,35 @@ use crate::{
 pub(crate) struct Summary {
     pub(crate) size: Size,
     pub(crate) rays: u64,
+    /// The largest share of a sample that was not traced.
+    pub(crate) cut: f64,
     /// From the first lease to the last tile.
     pub(crate) rendering: Duration,
     pub(crate) workers: usize,
 }
 
 impl Summary {
+    /// What there is to say of branches that were not traced.
+    fn cut_text(&self) -> String {
+        if self.cut > 0.0 {
+            format!(", at most {:.2} % of a sample cut off", 100.0 * self.cut)
+        } else {
+            String::new()
+        }
+    }
+
     /// Writes the one line that a render ends with.
     pub(crate) fn tell(&self, started: Instant, output: &Output) -> anyhow::Result<()> {
         let mrays = self.rays as f64 / 1e6;
         writeln!(
             io::stdout().lock(),
-            "{size} in {seconds:.2} s, {mrays:.1} Mrays, {rate:.1} Mrays/s, {workers} {noun}: {path}",
+            "{size} in {seconds:.2} s, {mrays:.1} Mrays, {rate:.1} Mrays/s, {workers} {noun}{cut}: {path}",
             size = self.size,
             seconds = started.elapsed().as_secs_f64(),
             rate = mrays / self.rendering.as_secs_f64().max(1e-9),
             workers = self.workers,
             noun = if self.workers == 1 { "worker" } else { "workers" },
+            cut = self.cut_text(),
             path = output.name().display()
         )
         .context("cannot write to standard output")
@@ -73,6 +85,11 @@ pub(crate) async fn run(
     };
     summary.tell(started, &output)?;
     Ok(())
+}
+
+/// Where the files are that a scene names: they are relative to its own.
+pub(crate) fn scene_folder(args: &PictureArgs) -> PathBuf {
+    if args.is_from_stdin() { ".".into() } else { folder_of(&args.scene) }
 }
 
 /// Reads the scene's file or standard input.
@@ -107,7 +124,7 @@ async fn place(
     stop: &CancellationToken,
 ) -> Result<Order, Failure> {
     let wish = args.wish(output.format());
-    let folder = if args.is_from_stdin() { ".".into() } else { folder_of(&args.scene) };
+    let folder = scene_folder(args);
     let (name, style) = (args.scene_name(), Console::drawing_style());
     let placing = spawn_blocking(move || {
         let placed = wish.place(&text, &|path: &str| fs::read(folder.join(Path::new(path))));
@@ -145,8 +162,8 @@ async fn render_here(
         let (folder, isa, stop) = (output.folder(), args.isa.0, stop.clone());
         move || {
             let rendered = local::render(order, &folder, (threads, isa), &progress, &stop);
-            let rays = progress.borrow().rays;
-            rendered.map(|rendered| (rendered, rays))
+            let (rays, cut) = (progress.borrow().rays, progress.borrow().cut);
+            rendered.map(|rendered| (rendered, rays, cut))
         }
     });
     let show = async {
@@ -156,9 +173,11 @@ async fn render_here(
     };
     let (rendered, ()) = tokio::join!(rendering, show);
     drop(bar);
-    let (Some((picture, rendering)), rays) = rendered?? else { return Err(Failure::Interrupted) };
+    let (Some((picture, rendering)), rays, cut) = rendered?? else {
+        return Err(Failure::Interrupted);
+    };
     write_picture(output, stop, move |write| write(&picture)).await?;
-    Ok(Summary { size, rays, rendering, workers: 0 })
+    Ok(Summary { size, rays, cut, rendering, workers: 0 })
 }
 
 async fn render_with_workers(
@@ -220,8 +239,9 @@ async fn render_with_workers(
     };
     stop_serving.cancel();
     serving.await??;
-    let rays = job.progress().borrow().rays;
-    Ok(Summary { size: job.picture().size(), rays, rendering: written?, workers })
+    let progress = job.progress();
+    let (rays, cut) = (progress.borrow().rays, progress.borrow().cut);
+    Ok(Summary { size: job.picture().size(), rays, cut, rendering: written?, workers })
 }
 
 /// A folder that only this user can look into; it goes when the answer does.

@@ -1,13 +1,17 @@
 //! `rtfarm submit`: a picture from a farm.
 
 use std::{
+    collections::BTreeMap,
+    fs,
     io::{self, Write},
+    path::Path,
+    sync::Mutex,
     time::Duration,
 };
 
 use anyhow::{Context, anyhow};
 use rtfarm_coordinator::Progress;
-use rtfarm_core::tile::Size;
+use rtfarm_core::{read::read_scene, tile::Size};
 use rtfarm_proto::{
     CHUNK_BYTES, MESSAGE_BYTES, PROTOCOL,
     wire::{self, event, jobs_client::JobsClient, submit_request::Part, submit_response::Outcome},
@@ -23,7 +27,7 @@ use crate::{
     console::Console,
     failure::Failure,
     output::Output,
-    render::{Summary, read_scene_text},
+    render::{Summary, read_scene_text, scene_folder},
 };
 
 /// A scene may be large and take long to prepare.
@@ -66,8 +70,8 @@ pub(crate) async fn run(
     let _ = tokio::time::timeout(DEADLINE, cancelled).await;
     let size = Size::try_from(submitted.frame.context("the coordinator names no size")?)?;
     let (event, rendering) = rendered?;
-    let (rays, workers) = (event.rays, event.workers as usize);
-    Summary { size, rays, rendering, workers }.tell(started, &output)?;
+    let (rays, cut, workers) = (event.rays, event.cut, event.workers as usize);
+    Summary { size, rays, cut, rendering, workers }.tell(started, &output)?;
     Ok(())
 }
 
@@ -87,13 +91,29 @@ async fn submit(
         samples: wish.samples,
         seed: wish.seed,
         flat: wish.flat,
+        cutoff: wish.cutoff,
         tile_side: wish.tile_side.map_or(0, |side| side as u32),
         format: wire::Format::from(wish.format).into(),
     };
+    let folder = scene_folder(&args.picture);
+    let (text, files) = spawn_blocking(move || {
+        let files = named_files(&text, &folder);
+        (text, files)
+    })
+    .await?;
     let (send, parts) = mpsc::channel(2);
     tokio::spawn(async move {
         let pieces = text.chunks(CHUNK_BYTES).map(|piece| Part::Text(piece.to_vec().into()));
-        for part in std::iter::once(Part::Order(order)).chain(pieces) {
+        let files = files.iter().flat_map(|(path, data)| {
+            // An empty file is one empty piece.
+            let count = data.len().div_ceil(CHUNK_BYTES).max(1);
+            (0..count).map(move |k| {
+                let end = data.len().min((k + 1) * CHUNK_BYTES);
+                let data = data[k * CHUNK_BYTES..end].to_vec().into();
+                Part::File(wire::FilePiece { path: path.clone(), data })
+            })
+        });
+        for part in std::iter::once(Part::Order(order)).chain(pieces).chain(files) {
             if send.send(wire::SubmitRequest { part: Some(part) }).await.is_err() {
                 return;
             }
@@ -110,6 +130,18 @@ async fn submit(
         }
         None => Err(Failure::Other(anyhow!("the coordinator's answer makes no sense"))),
     }
+}
+
+/// The files that a scene names, by the names that it has for them. One that cannot be read is
+/// left out: the coordinator will miss it where the scene names it.
+fn named_files(text: &[u8], folder: &Path) -> BTreeMap<String, Vec<u8>> {
+    let files = Mutex::new(BTreeMap::new());
+    read_scene(text, &|path: &str| {
+        let data = fs::read(folder.join(path))?;
+        files.lock().expect("nothing here panics").insert(path.to_owned(), data.clone());
+        Ok(data)
+    });
+    files.into_inner().expect("nothing here panics")
 }
 
 /// Waits for the job's end. Answers with the last event and the time that the rendering took.

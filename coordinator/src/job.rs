@@ -30,6 +30,8 @@ pub struct Progress {
     pub tile_count: u32,
     /// Rays traced for the tiles in the picture.
     pub rays: u64,
+    /// The largest sum of weights not traced in any sample so far.
+    pub cut: f64,
     /// Workers that brought some of them.
     pub workers: BTreeSet<WorkerId>,
     /// Tiles of which two copies differed.

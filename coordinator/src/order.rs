@@ -2,7 +2,8 @@
 
 use rtfarm_core::{
     picture::PictureFormat,
-    prepared::{PrepareError, PreparedBytes, prepare},
+    prepare::{PrepareError, prepare},
+    prepared::PreparedBytes,
     read::{Diagnostic, Omitted, Reading, Resolve, Severity, read_scene},
     render::Settings,
     scene::Scene,
@@ -25,6 +26,8 @@ pub struct Wish {
     pub seed: u64,
     /// Plain colours.
     pub flat: bool,
+    /// The weight below which a branch is not traced.
+    pub cutoff: f64,
     /// The side of a tile in pixels; chosen by the frame's size when missing.
     pub tile_side: Option<u64>,
     /// How the picture is written.
@@ -107,7 +110,8 @@ impl Wish {
             }
             None => other(error.to_string()),
         })?;
-        let Self { name, samples, seed, flat, format, .. } = self;
-        Ok(Order { name, prepared, settings: Settings { size, samples, seed, flat }, grid, format })
+        let Self { name, samples, seed, flat, cutoff, format, .. } = self;
+        let settings = Settings { size, samples, seed, flat, cutoff };
+        Ok(Order { name, prepared, settings, grid, format })
     }
 }

@@ -1,6 +1,7 @@
 //! The gRPC services: parse, decide, answer. A `Status` is chosen here and nowhere else.
 
 use std::{
+    collections::HashMap,
     io::{self, BufWriter, Read, Seek},
     pin::Pin,
     sync::Arc,
@@ -37,8 +38,8 @@ use crate::{
     run::{Coordinator, Shared},
 };
 
-/// The longest scene text that a client may send.
-const LONGEST_TEXT: usize = 1 << 31;
+/// The most bytes that a scene and its files may have.
+const LONGEST_BUNDLE: usize = 1 << 31;
 
 /// A watching client hears of changes no more often than this.
 const WATCH_PERIOD: Duration = Duration::from_millis(50);
@@ -253,6 +254,7 @@ impl Shared {
         job.progress.send_modify(|progress| {
             progress.tiles_done += 1;
             progress.rays += delivery.rays;
+            progress.cut = progress.cut.max(delivery.cut);
             progress.workers.insert(worker);
             now_done.clone_from(progress);
         });
@@ -281,14 +283,16 @@ impl jobs_server::Jobs for JobsService {
         &self,
         request: Request<Streaming<wire::SubmitRequest>>,
     ) -> Result<Response<wire::SubmitResponse>, Status> {
-        let (order, text) = receive(request.into_inner()).await?;
+        let Bundle { order, text, files } = receive(request.into_inner()).await?;
         check_version("client", &order.version, order.protocol, &self.shared)?;
         let wish = to_wish(order).map_err(invalid)?;
         let coordinator = Coordinator { shared: Arc::clone(&self.shared) };
         let (outcome, report) = blocking(move || {
             let resolve = |path: &str| {
-                let reason = format!("`{path}` was not sent along with the scene");
-                Err(io::Error::new(io::ErrorKind::NotFound, reason))
+                files.get(path).cloned().ok_or_else(|| {
+                    let reason = format!("`{path}` was not sent along with the scene");
+                    io::Error::new(io::ErrorKind::NotFound, reason)
+                })
             };
             let name = wish.name.clone();
             let Placed { order, diagnostics, omitted } = wish.place(&text, &resolve);
@@ -383,34 +387,49 @@ impl JobsService {
     }
 }
 
-async fn receive(
-    mut parts: Streaming<wire::SubmitRequest>,
-) -> Result<(wire::Order, Vec<u8>), Status> {
-    let (mut order, mut text) = (None, Vec::new());
+/// A scene as a client sends it: its text and the files that it names.
+struct Bundle {
+    order: wire::Order,
+    text: Vec<u8>,
+    files: HashMap<String, Vec<u8>>,
+}
+
+async fn receive(mut parts: Streaming<wire::SubmitRequest>) -> Result<Bundle, Status> {
+    let (mut order, mut text, mut files) = (None, Vec::new(), HashMap::<String, Vec<u8>>::new());
+    let mut byte_count = 0;
     while let Some(part) = parts.message().await? {
         match part.part {
             Some(submit_request::Part::Order(first)) => order = Some(first),
-            Some(submit_request::Part::Text(piece)) if text.len() < LONGEST_TEXT => {
+            Some(submit_request::Part::Text(piece)) => {
+                byte_count += piece.len();
                 text.extend_from_slice(&piece);
             }
-            Some(submit_request::Part::Text(_)) => {
-                return Err(Status::resource_exhausted("the scene's text is too long"));
+            Some(submit_request::Part::File(piece)) => {
+                byte_count += piece.path.len() + piece.data.len();
+                files.entry(piece.path).or_default().extend_from_slice(&piece.data);
             }
             None => {}
         }
+        if byte_count > LONGEST_BUNDLE {
+            return Err(Status::resource_exhausted("the scene and its files are too long"));
+        }
     }
-    Ok((order.ok_or_else(|| invalid(WireError::Missing("order")))?, text))
+    let order = order.ok_or_else(|| invalid(WireError::Missing("order")))?;
+    Ok(Bundle { order, text, files })
 }
 
 fn to_wish(order: wire::Order) -> Result<Wish, WireError> {
     let format = order.format().try_into()?;
     let size = order.frame.map(Size::try_from).transpose()?;
-    let wire::Order { name, samples, seed, flat, tile_side, .. } = order;
+    let wire::Order { name, samples, seed, flat, cutoff, tile_side, .. } = order;
     if !rtfarm_proto::SAMPLES.contains(&samples) {
         return Err(WireError::Samples(samples));
     }
+    if !(0.0..=1.0).contains(&cutoff) {
+        return Err(WireError::Cutoff(cutoff));
+    }
     let tile_side = (tile_side > 0).then_some(tile_side.into());
-    Ok(Wish { name, size, samples, seed, flat, tile_side, format })
+    Ok(Wish { name, size, samples, seed, flat, cutoff, tile_side, format })
 }
 
 fn to_event(progress: &Progress) -> wire::Event {
@@ -418,6 +437,7 @@ fn to_event(progress: &Progress) -> wire::Event {
         tiles_done: progress.tiles_done,
         tile_count: progress.tile_count,
         rays: progress.rays,
+        cut: progress.cut,
         workers: progress.workers.len() as u32,
         differing_tiles: progress.differing_tiles,
         end: progress.end.as_ref().map(|end| match end {

@@ -501,25 +501,24 @@ impl Faces {
         let mut planes = vec![FacePlane::Own; count];
         for group in by_plane.chunk_by(|a, b| a.0 == b.0) {
             let first = group[0].2 as usize;
-            if group.len() == 1 && first < triangles {
-                continue;
+            if group.len() > 1 || first >= triangles {
+                self.share_plane(group.iter().map(|&(_, _, face)| face as usize), &mut planes);
             }
-            let plane = self.plane_of(first);
-            let index = self.shared.len();
-            for &(_, _, face) in group {
-                let normal = self.normal_of(face as usize);
-                let is_turned = normal.dot(DVec3::from_array(plane.normal)) < 0.0;
-                planes[face as usize] = FacePlane::Shared(PlaneIndex::new(index, is_turned));
-            }
-            self.shared.push(plane);
         }
-        // Quadrangles that are flat only within rounding have planes of their own.
-        for (face, plane) in planes.iter_mut().enumerate().skip(triangles) {
-            if matches!(plane, FacePlane::Own) {
-                *plane = FacePlane::Shared(PlaneIndex::new(self.shared.len(), false));
-                let record = self.plane_of(face);
-                self.shared.push(record);
-            }
+        // Quadrangles that are flat only within rounding share theirs with those of the same
+        // corners.
+        let mut by_corners: Vec<([u32; 4], u32, usize)> = (triangles..count)
+            .filter(|&face| matches!(planes[face], FacePlane::Own))
+            .map(|face| {
+                let mut corners = [0; 4];
+                corners.copy_from_slice(&self.welded[self.corner_range(face)]);
+                corners.sort_unstable();
+                (corners, self.rank(face), face)
+            })
+            .collect();
+        by_corners.sort_unstable();
+        for group in by_corners.chunk_by(|a, b| a.0 == b.0) {
+            self.share_plane(group.iter().map(|&(_, _, face)| face), &mut planes);
         }
         let of_solids = &planes[self.flat_count()..];
         for (&(leaf, _), planes) in self.boxes.iter().zip(of_solids.chunks(6)) {
@@ -530,6 +529,18 @@ impl Faces {
             }
         }
         self.planes = planes;
+    }
+
+    /// Gives faces, in the order of their ranks, the first one's plane.
+    fn share_plane(&mut self, group: impl Iterator<Item = usize>, planes: &mut [FacePlane]) {
+        let mut group = group.peekable();
+        let plane = self.plane_of(*group.peek().expect("a group has a face"));
+        let index = self.shared.len();
+        for face in group {
+            let is_turned = self.normal_of(face).dot(DVec3::from_array(plane.normal)) < 0.0;
+            planes[face] = FacePlane::Shared(PlaneIndex::new(index, is_turned));
+        }
+        self.shared.push(plane);
     }
 
     /// The plane through the mean corner with Newell's normal.

@@ -77,5 +77,7 @@ fn hit_chord(corners: &[Projected; 4]) -> f64 {
         }
     }
     let width = right.0 - left.0;
-    if width > 0.0 { (left.1 * right.0 - right.1 * left.0) / width } else { left.1 }
+    let t = if width > 0.0 { (left.1 * right.0 - right.1 * left.0) / width } else { left.1 };
+    let [a, b, c, d] = corners.map(|corner| corner.z);
+    t.max(a.min(b).min(c.min(d))).min(a.max(b).max(c.max(d)))
 }

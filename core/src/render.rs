@@ -296,12 +296,15 @@ impl Batch {
     fn light(&mut self, view: &View<'_>, index: usize, isa: Isa) -> u64 {
         let light = &view.lights[index];
         let [position, intensity] = [light.position, light.intensity].map(DVec3::from_array);
+        let touches = view.touches(light);
         self.shadow_rays.clear();
         self.arrivals.clear();
         for (k, point) in self.points.iter().enumerate() {
             let to_light = position - point.position;
             let height = point.normal.dot(to_light);
-            if height > 0.0 {
+            // Where the light is on the surface the height is rounding, but the distance may be
+            // as small.
+            if height > 0.0 && !touches.contains(&point.surface) {
                 let distance = to_light.length();
                 self.arrivals.push((k, intensity * (height / (distance * distance * distance))));
                 self.shadow_rays.push(Ray {

@@ -11,7 +11,7 @@ use rtfarm_core::{
 use crate::wire;
 
 /// Why a message means nothing.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum WireError {
     /// A part that must be there is not.
     #[error("the message lacks its {0}")]
@@ -25,6 +25,9 @@ pub enum WireError {
     /// A number is out of its range.
     #[error("{0} samples a pixel are out of range")]
     Samples(u32),
+    /// A number is out of its range.
+    #[error("a cut-off of {0} is out of range")]
+    Cutoff(f64),
     /// The frame is none.
     #[error(transparent)]
     Size(#[from] SizeError),
@@ -51,18 +54,21 @@ impl TryFrom<wire::Settings> for Settings {
     type Error = WireError;
 
     fn try_from(settings: wire::Settings) -> Result<Self, WireError> {
-        let wire::Settings { width, height, samples, seed, flat } = settings;
+        let wire::Settings { width, height, samples, seed, flat, cutoff } = settings;
         if !SAMPLES.contains(&samples) {
             return Err(WireError::Samples(samples));
         }
-        Ok(Self { size: wire::Frame { width, height }.try_into()?, samples, seed, flat })
+        if !(0.0..=1.0).contains(&cutoff) {
+            return Err(WireError::Cutoff(cutoff));
+        }
+        Ok(Self { size: wire::Frame { width, height }.try_into()?, samples, seed, flat, cutoff })
     }
 }
 
 impl From<Settings> for wire::Settings {
     fn from(settings: Settings) -> Self {
-        let Settings { size, samples, seed, flat } = settings;
-        Self { width: size.width(), height: size.height(), samples, seed, flat }
+        let Settings { size, samples, seed, flat, cutoff } = settings;
+        Self { width: size.width(), height: size.height(), samples, seed, flat, cutoff }
     }
 }
 
@@ -136,12 +142,15 @@ mod tests {
 
     #[test]
     fn settings_out_of_range_are_refused() {
-        let good = wire::Settings { width: 2, height: 3, samples: 1, seed: 9, flat: true };
+        let good =
+            wire::Settings { width: 2, height: 3, samples: 1, seed: 9, flat: true, cutoff: 0.5 };
         let settings = Settings::try_from(good).unwrap();
         assert_eq!(wire::Settings::from(settings), good);
         for bad in [
             wire::Settings { width: 0, ..good },
             wire::Settings { height: 65_536, ..good },
+            wire::Settings { cutoff: f64::NAN, ..good },
+            wire::Settings { cutoff: 2.0, ..good },
             wire::Settings { samples: 0, ..good },
             wire::Settings { samples: 65_537, ..good },
         ] {

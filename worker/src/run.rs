@@ -377,6 +377,7 @@ impl Member {
                         hash: blake3::hash(&pixels).as_bytes().to_vec().into(),
                         pixels,
                         rays: tile_pixels.rays,
+                        cut: tile_pixels.cut,
                         seconds: started.elapsed().as_secs_f64(),
                     }
                 });
