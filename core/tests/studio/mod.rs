@@ -4,7 +4,8 @@ use std::ops::ControlFlow;
 
 use rtfarm_core::{
     isa::Isa,
-    prepared::{PreparedBytes, PreparedScene, prepare},
+    prepare::prepare,
+    prepared::{PreparedBytes, PreparedScene},
     read::read_scene,
     render::{DEFAULT_CUTOFF, Settings, render_tile},
     scene::Scene,
@@ -24,7 +25,13 @@ pub(crate) fn prepared(scene: &Scene) -> PreparedScene<PreparedBytes> {
 }
 
 pub(crate) fn settings(width: u64, height: u64, samples: u32) -> Settings {
-    Settings { size: Size::new(width, height).unwrap(), samples, seed: 5, flat: false }
+    Settings {
+        size: Size::new(width, height).unwrap(),
+        samples,
+        seed: 5,
+        flat: false,
+        cutoff: DEFAULT_CUTOFF,
+    }
 }
 
 pub(crate) fn whole(size: Size) -> Area {
