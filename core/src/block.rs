@@ -397,19 +397,23 @@ impl<'t> Blocks<'t> {
     /// Reports a word that begins with `end` and ends nothing; whether it closed the block.
     fn finish_unknown_end(&mut self, word: &Word<'t>) -> bool {
         let end = self.innermost().end();
-        let guess =
-            suggestion(word.bytes, [end].into_iter().chain(OPENED.iter().map(|block| block.end())));
-        let is_open = self.open.last().is_some();
-        self.report.error(word.span(), || match (&guess, is_open) {
-            (Some(guess), _) => {
-                format!("{} ends no block; did you mean `{guess}`?", shown(word.bytes))
+        let is_open = !self.open.is_empty();
+        let closes = is_open
+            && word.bytes.len().abs_diff(end.len()) <= 3
+            && suggestion(word.bytes, [end]).is_some();
+        self.report.error(word.span(), || {
+            let ends = OPENED.iter().map(|block| block.end());
+            let guess = if closes { Some(end.to_owned()) } else { suggestion(word.bytes, ends) };
+            match (guess, is_open) {
+                (Some(guess), _) => {
+                    format!("{} ends no block; did you mean `{guess}`?", shown(word.bytes))
+                }
+                (None, true) => {
+                    format!("{} ends no block; `{end}` would end this one", shown(word.bytes))
+                }
+                (None, false) => format!("{} ends no block", shown(word.bytes)),
             }
-            (None, true) => {
-                format!("{} ends no block; `{end}` would end this one", shown(word.bytes))
-            }
-            (None, false) => format!("{} ends no block", shown(word.bytes)),
         });
-        let closes = is_open && guess.as_deref() == Some(end);
         if closes {
             self.leave();
         }
@@ -427,31 +431,34 @@ impl<'t> Blocks<'t> {
             self.skip_line();
             return;
         }
-        let candidates = || {
+        let is_block = self.skip_unknown(&word);
+        let hint = || {
             let inner =
                 OPENED.iter().filter(|inner| inner.stands_in(block)).map(|inner| inner.word());
-            block.fields().iter().copied().chain(inner)
+            suggestion(word.bytes, block.fields().iter().copied().chain(inner))
+                .map(|guess| format!("; did you mean `{guess}`?"))
         };
-        let hint =
-            suggestion(word.bytes, candidates()).map(|guess| format!("; did you mean `{guess}`?"));
-        let is_block = self.skip_unknown(&word);
-        let word = (word.span(), shown(word.bytes));
         match (block, is_block) {
-            (Block::File, false) => self.report.error(word.0, || {
-                let hint = hint.unwrap_or_else(|| {
+            (Block::File, false) => self.report.error(word.span(), || {
+                let sections = || {
                     ": a file consists of `viewport`, `materials`, `lights` and `geometry`".into()
-                });
-                format!("{} begins no section{hint}", word.1)
-            }),
-            (_, true) => self.report.warn(word.0, || {
-                format!("the block {} is unknown and skipped{}", word.1, hint.unwrap_or_default())
-            }),
-            (_, false) => self.report.warn(word.0, || {
+                };
                 format!(
-                    "`{}` knows no {}; skipped to the end of the line{}",
+                    "{} begins no section{}",
+                    shown(word.bytes),
+                    hint().unwrap_or_else(sections)
+                )
+            }),
+            (_, true) => self.report.warn(word.span(), || {
+                let hint = hint().unwrap_or_default();
+                format!("the block {} is unknown and skipped{hint}", shown(word.bytes))
+            }),
+            (_, false) => self.report.warn(word.span(), || {
+                let hint = hint().unwrap_or_default();
+                format!(
+                    "`{}` knows no {}; skipped to the end of the line{hint}",
                     block.word(),
-                    word.1,
-                    hint.unwrap_or_default()
+                    shown(word.bytes)
                 )
             }),
         }

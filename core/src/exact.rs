@@ -154,11 +154,6 @@ fn is_simple(corners: &[DVec3; 4], normal: DVec3, triples: &[[DVec3; 3]; 4]) -> 
     let size = normal.abs();
     let mut axes = [0, 1, 2];
     axes.sort_by(|&j, &k| size[k].total_cmp(&size[j]));
-    let project = |axis: usize, point: DVec3| match axis {
-        0 => DVec2::new(point.y, point.z),
-        1 => DVec2::new(point.z, point.x),
-        _ => DVec2::new(point.x, point.y),
-    };
     let is_flat = |axis: usize| {
         triples.iter().all(|triple| {
             let [a, b, c] = triple.map(|point| project(axis, point));
@@ -174,6 +169,15 @@ fn is_simple(corners: &[DVec3; 4], normal: DVec3, triples: &[[DVec3; 3]; 4]) -> 
     !segments_touch([a, b], [c, d])
         && !segments_touch([b, c], [d, a])
         && ![[a, b, c], [b, c, d], [c, d, a], [d, a, b]].iter().any(|&[a, b, c]| is_spike(a, b, c))
+}
+
+/// A point as the coordinate axis `axis` sees it, counter-clockwise staying so.
+pub(crate) fn project(axis: usize, point: DVec3) -> DVec2 {
+    match axis {
+        0 => DVec2::new(point.y, point.z),
+        1 => DVec2::new(point.z, point.x),
+        _ => DVec2::new(point.x, point.y),
+    }
 }
 
 /// Whether two segments have a point in common.
@@ -225,7 +229,7 @@ fn decode(number: f64) -> (i64, i32) {
 }
 
 /// The exponent that makes `number` · 2^-exponent lie in 0.5..1; 0 for zero.
-fn exponent(number: f64) -> i32 {
+pub(crate) fn exponent(number: f64) -> i32 {
     let (mantissa, exponent) = decode(number);
     if mantissa == 0 {
         0
@@ -235,7 +239,7 @@ fn exponent(number: f64) -> i32 {
 }
 
 /// `number` · 2^power.
-fn scale_by_power(mut number: f64, mut power: i32) -> f64 {
+pub(crate) fn scale_by_power(mut number: f64, mut power: i32) -> f64 {
     const STEP: i32 = 1000;
     let power_of_two = |power: i32| f64::from_bits(((1023 + power) as u64) << 52);
     while power > STEP {

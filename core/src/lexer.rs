@@ -3,6 +3,8 @@
 
 use std::ops::Range;
 
+use crate::number::parse_number;
+
 /// Walks over the words of a scene text.
 #[derive(Debug, Clone)]
 pub(crate) struct Lexer<'t> {
@@ -77,13 +79,6 @@ fn unsigned(word: &[u8]) -> &[u8] {
 
 fn is_infinity_or_nan(unsigned: &[u8]) -> bool {
     ["nan", "inf", "infinity"].iter().any(|name| unsigned.eq_ignore_ascii_case(name.as_bytes()))
-}
-
-/// The decimal number that `word` spells, rounded correctly; -0 becomes 0. Numbers beyond f64 are
-/// infinite.
-pub(crate) fn parse_number(word: &[u8]) -> Option<f64> {
-    let number: f64 = fast_float2::parse(word).ok()?;
-    Some(number + 0.0)
 }
 
 /// What a byte does to the words around it.

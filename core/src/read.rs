@@ -5,7 +5,7 @@
 //! materials are resolved at the end, since they may be used before they are defined; so are
 //! byte offsets into lines and columns.
 
-use std::{collections::HashMap, io};
+use std::{collections::HashMap, io, sync::Arc};
 
 use glam::{DVec2, DVec3};
 
@@ -15,10 +15,11 @@ use crate::{
     diagnostic::{Places, Report, shown},
     exact::{self, QuadrangleFault},
     lexer::Word,
-    mesh_file, scene,
+    mesh_file::{self, MeshFile},
+    scene,
     scene::{
-        Light, Material, MaterialPlaces, Mesh, Operation, Parallelepiped, Quadrangle, Scene, Solid,
-        SolidNode, Sphere, Triangle, Viewport,
+        Light, Material, MaterialPlaces, Mesh, MeshShape, MeshVertices, Operation, Parallelepiped,
+        Quadrangle, Scene, Solid, SolidNode, Sphere, Triangle, Viewport,
     },
     symbol::Symbols,
     texture,
@@ -918,8 +919,10 @@ impl<'t> Reader<'t> {
             self.mesh_words.push(MeshWords { opening, file });
             self.scene.meshes.push(Mesh {
                 path: String::from_utf8_lossy(file.bytes).into_owned(),
-                vertices: scene::MeshVertices::Single(Vec::new()),
-                triangles: Vec::new(),
+                shape: Arc::new(MeshShape {
+                    vertices: MeshVertices::Single(Vec::new()),
+                    triangles: Vec::new(),
+                }),
                 scale: scale.value.unwrap_or(1.0),
                 rotate: rotate.value,
                 offset: offset.value.unwrap_or_default(),
@@ -1053,17 +1056,28 @@ impl<'t> Reader<'t> {
         }
     }
 
+    /// Reads every mesh file once.
     fn read_meshes(&mut self, resolve: &Resolve<'_>) {
+        let mut known: HashMap<String, Arc<MeshShape>> = HashMap::new();
         for (mesh, words) in self.scene.meshes.iter_mut().zip(&self.mesh_words) {
-            let shape = resolve(&mesh.path).map_err(|error| error.to_string()).and_then(|bytes| {
+            if let Some(shape) = known.get(&mesh.path) {
+                mesh.shape = Arc::clone(shape);
+                continue;
+            }
+            let file = resolve(&mesh.path).map_err(|error| error.to_string()).and_then(|bytes| {
                 mesh_file::read_mesh(&mesh.path, &bytes).map_err(|error| error.to_string())
             });
-            match shape {
-                Ok(shape) => (mesh.vertices, mesh.triangles) = (shape.vertices, shape.triangles),
+            match file {
+                Ok(MeshFile { shape, dropped }) => {
+                    mesh.shape = Arc::new(shape);
+                    self.scene.dropped.zero_area += dropped.zero_area;
+                    self.scene.dropped.duplicates += dropped.duplicates;
+                }
                 Err(error) => self.blocks.report.error(words.file.span(), || {
                     format!("cannot read the mesh {}: {error}", shown(words.file.bytes))
                 }),
             }
+            known.insert(mesh.path.clone(), Arc::clone(&mesh.shape));
         }
     }
 

@@ -3,15 +3,15 @@
 //! not plain and leaves it to the reader of all blocks, so that there is one place that knows
 //! about mistakes, and any number of threads reads the same scene.
 
-use std::hash::{BuildHasher, RandomState};
-
 use glam::{DVec2, DVec3};
 use hashbrown::{HashTable, hash_table::Entry};
 use rayon::prelude::*;
 
 use crate::{
     exact::is_collinear,
-    lexer::{Class, Lexer, Quotes, Word, class, parse_number},
+    hash::{mix, random_key, spread},
+    lexer::{Class, Lexer, Quotes, Word, class},
+    number::scan_number,
     scene::{Dropped, Triangle},
     symbol::Symbols,
 };
@@ -45,7 +45,7 @@ impl Triangles {
             texcoords: Vec::new(),
             dropped: Dropped::default(),
             table: HashTable::new(),
-            key: RandomState::new().hash_one(0),
+            key: random_key(),
             parallel_from: 0,
         }
     }
@@ -220,7 +220,7 @@ fn find_triangle_line(text: &[u8], from: usize, reach: usize) -> Option<usize> {
     memchr::memchr_iter(b'\n', text.get(from..end)?)
         .map(|line_end| {
             let mut scanner = Scanner { text, at: from + line_end + 1 };
-            while matches!(scanner.byte(), b' ' | b'\t') {
+            while matches!(text.get(scanner.at), Some(b' ' | b'\t')) {
                 scanner.at += 1;
             }
             scanner.at
@@ -359,62 +359,12 @@ impl<'t> Scanner<'t> {
     }
 
     /// Reads a finite number and the space behind it.
-    ///
-    /// Source of the short way: Clinger, "How to Read Floating Point Numbers Accurately" (1990):
-    /// whole numbers below 2^53 and powers of ten up to 10^22 are exact, so that one division
-    /// rounds once.
     fn number(&mut self) -> Option<f64> {
-        let start = self.at;
-        let mut byte = self.byte();
-        let is_negative = byte == b'-';
-        if is_negative || byte == b'+' {
-            self.at += 1;
-            byte = self.byte();
-        }
-        let digits_start = self.at;
-        let mut mantissa = 0_u64;
-        while byte.is_ascii_digit() {
-            mantissa = mantissa.wrapping_mul(10).wrapping_add(u64::from(byte - b'0'));
-            self.at += 1;
-            byte = self.byte();
-        }
-        let mut digit_count = self.at - digits_start;
-        let mut decimals = 0;
-        if byte == b'.' {
-            self.at += 1;
-            let decimals_start = self.at;
-            byte = self.byte();
-            while byte.is_ascii_digit() {
-                mantissa = mantissa.wrapping_mul(10).wrapping_add(u64::from(byte - b'0'));
-                self.at += 1;
-                byte = self.byte();
-            }
-            decimals = self.at - decimals_start;
-            digit_count += decimals;
-        }
-        let number = if digit_count > 0
-            && digit_count <= 19
-            && mantissa <= 1 << 53
-            && decimals < POWERS_OF_TEN.len()
-            && matches!(class(byte), Class::Space | Class::Comment)
-        {
-            let size = mantissa as f64 / POWERS_OF_TEN[decimals];
-            if is_negative { 0.0 - size } else { size }
-        } else {
-            while class(self.byte()) == Class::Word {
-                self.at += 1;
-            }
-            parse_number(&self.text[start..self.at]).filter(|number| number.is_finite())?
-        };
+        let number = scan_number(self.text, &mut self.at)?;
         self.skip_space()?;
         Some(number)
     }
 }
-
-const POWERS_OF_TEN: [f64; 23] = [
-    1e0, 1e1, 1e2, 1e3, 1e4, 1e5, 1e6, 1e7, 1e8, 1e9, 1e10, 1e11, 1e12, 1e13, 1e14, 1e15, 1e16,
-    1e17, 1e18, 1e19, 1e20, 1e21, 1e22,
-];
 
 /// Whether two triangles are the same but for the vertex that they begin with.
 fn is_copy(
@@ -462,13 +412,100 @@ fn hash_vertices(vertices: &[DVec3; 3], key: u64) -> u64 {
     hash
 }
 
-/// Mixes `word` into a hash: both halves of a product, which hang on all bits of both factors.
-fn mix(hash: u64, word: u64) -> u64 {
-    let product = u128::from(hash ^ word) * 0x9e37_79b9_7f4a_7c15;
-    (product as u64) ^ (product >> 64) as u64
-}
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::read::{Reading, read_scene_in_pieces};
 
-/// Half a hash as a whole one: tables take the place from the low bits and a tag from the high.
-fn spread(half: u32) -> u64 {
-    u64::from(half) | u64::from(half) << 32
+    /// Reads with pieces of a few bytes on two threads, with whole pieces on one thread, and
+    /// compares.
+    fn check_same(text: &str) -> Reading {
+        let read = |threads: usize, piece: usize| {
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+            pool.install(|| {
+                read_scene_in_pieces(
+                    text.as_bytes(),
+                    &|_| Err(std::io::ErrorKind::NotFound.into()),
+                    piece,
+                )
+            })
+        };
+        let expected = read(1, usize::MAX);
+        for (threads, piece) in [(1, 1), (2, 1), (2, 100), (3, 333), (2, 1000), (2, PIECE)] {
+            let reading = read(threads, piece);
+            assert_eq!(
+                reading.diagnostics, expected.diagnostics,
+                "{threads} threads, pieces of {piece}"
+            );
+            assert_eq!(reading.omitted, expected.omitted);
+            assert_eq!(format!("{:?}", reading.scene), format!("{:?}", expected.scene));
+        }
+        expected
+    }
+
+    fn scene(shapes: impl IntoIterator<Item = String>) -> String {
+        let shapes: String = shapes.into_iter().collect();
+        format!(
+            "materials entry name a endentry entry name b endentry endmaterials\ngeometry\n{shapes}endgeometry\n"
+        )
+    }
+
+    fn triangle(k: usize) -> String {
+        let material = if k % 3 == 0 { "a" } else { "b" };
+        format!(
+            "triangle\n\tvertex 0 0 {k}\n\tvertex 1 0 {k}.5\n\tvertex 0 1 {k}e-1\n\tmaterial {material}\nendtriangle\n"
+        )
+    }
+
+    #[test]
+    fn pieces_give_what_the_whole_gives() {
+        let reading = check_same(&scene((0..1000).map(triangle)));
+        assert_eq!(reading.scene.unwrap().triangles.len(), 1000);
+    }
+
+    #[test]
+    fn copies_and_flat_ones_are_found_across_pieces() {
+        let flat = "triangle vertex 0 0 0 vertex 1 1 1 vertex 2 2 2 material a endtriangle\n";
+        let reading = check_same(&scene(
+            (0..1000).map(|k| if k % 7 == 0 { flat.into() } else { triangle(k % 400) }),
+        ));
+        let scene = reading.scene.unwrap();
+        assert_eq!(
+            (scene.dropped.zero_area, scene.dropped.zero_area + scene.dropped.duplicates),
+            (143, 600)
+        );
+    }
+
+    #[test]
+    fn anything_between_plain_triangles_is_read() {
+        let odd = [
+            "# a comment\n triangle\n",
+            "sphere coords 0 0 0 radius 1 material a endsphere\n",
+            "triangle vertex 0 0 0 texcoord 0 0 vertex 1 0 0 texcoord 1 0 vertex 0 1 0 texcoord 0 1 material b endtriangle",
+            "triangle material a vertex 0 0 0 vertex 1 0 0 vertex 0 1 0 endtriangle triangle\n",
+            "triangle vertex 0 0 0\n vertex 1 0 0 vertex 0 1 x\n material\ntriangle\nendtriangle\n",
+            "union\n\n",
+            "endtriangle\n",
+            "endgeometry\ngeometry\n",
+            "triangle vertex 0 0 0 vertex 1 0 0 vertex 0 1 1e999 material a endtriangle\n",
+            "triangle vertex 0 0 0 vertex 1 0 0 vertex 0 1 0 material unknown endtriangle\n",
+            "fog\ntriangle\nendfog\n",
+            "… \u{a0}",
+        ];
+        for odd in odd {
+            for every in [1, 10, 97] {
+                check_same(&scene(
+                    (0..200).map(|k| {
+                        format!("{}{}", if k % every == 0 { odd } else { "" }, triangle(k))
+                    }),
+                ));
+            }
+        }
+    }
+
+    #[test]
+    fn triangles_on_one_line_are_read() {
+        let reading = check_same(&scene((0..500).map(|k| triangle(k).replace('\n', " "))));
+        assert_eq!(reading.scene.unwrap().triangles.len(), 500);
+    }
 }
