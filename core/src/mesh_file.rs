@@ -142,7 +142,6 @@ pub(crate) struct MeshBuilder<T> {
     vertices: Vec<[T; 3]>,
     vertex_table: HashTable<u32>,
     triangles: Vec<[u32; 3]>,
-    triangle_table: HashTable<u32>,
     key: u64,
     dropped: Dropped,
 }
@@ -153,9 +152,8 @@ impl<T: Copy + Into<f64>> MeshBuilder<T> {
     pub(crate) fn with_capacity(vertices: usize, triangles: usize) -> Self {
         Self {
             vertices: Vec::with_capacity(vertices),
-            vertex_table: HashTable::new(),
+            vertex_table: HashTable::with_capacity(vertices),
             triangles: Vec::with_capacity(triangles),
-            triangle_table: HashTable::new(),
             key: random_key(),
             dropped: Dropped::default(),
         }
@@ -189,22 +187,10 @@ impl<T: Copy + Into<f64>> MeshBuilder<T> {
             self.dropped.zero_area += 1;
             return Ok(());
         }
-        let (triangles, key) = (&self.triangles, self.key);
-        let wanted = turned(corners);
-        let hash =
-            |[a, b, c]: [u32; 3]| mix(mix(key, u64::from(a)), u64::from(b) << 32 | u64::from(c));
-        let is_same = |&index: &u32| turned(triangles[index as usize]) == wanted;
-        match self
-            .triangle_table
-            .entry(hash(wanted), is_same, |&index| hash(turned(triangles[index as usize])))
-        {
-            Entry::Occupied(_) => self.dropped.duplicates += 1,
-            Entry::Vacant(place) => {
-                let index = u32::try_from(triangles.len()).map_err(|_| MeshFault::TooLarge)?;
-                place.insert(index);
-                self.triangles.push(corners);
-            }
+        if self.triangles.len() == u32::MAX as usize {
+            return Err(MeshFault::TooLarge);
         }
+        self.triangles.push(corners);
         Ok(())
     }
 
@@ -229,15 +215,59 @@ impl<T: Copy + Into<f64>> MeshBuilder<T> {
         DVec3::from(self.vertices[index as usize].map(Into::into))
     }
 
+    /// Drops every triangle that stands there already. Only those of one smallest corner can be
+    /// equal, and those are few and near each other: this costs less than a table of all.
+    fn drop_copies(&mut self) {
+        let triangles = &self.triangles;
+        // How many triangles have each smallest corner, then where those begin in `order`.
+        let mut starts = vec![0_u32; self.vertices.len() + 1];
+        for &triangle in triangles {
+            starts[turned(triangle)[0] as usize] += 1;
+        }
+        let mut sum = 0;
+        for start in &mut starts {
+            sum += *start;
+            *start = sum;
+        }
+        let mut order = vec![0_u32; triangles.len()];
+        for (index, &triangle) in triangles.iter().enumerate().rev() {
+            let start = &mut starts[turned(triangle)[0] as usize];
+            *start -= 1;
+            order[*start as usize] = index as u32;
+        }
+        let mut copies: Vec<u32> = Vec::new();
+        for bounds in starts.windows(2) {
+            let group = &mut order[bounds[0] as usize..bounds[1] as usize];
+            group.sort_unstable_by_key(|&index| (turned(triangles[index as usize]), index));
+            let is_copy = |pair: &&[u32]| {
+                turned(triangles[pair[0] as usize]) == turned(triangles[pair[1] as usize])
+            };
+            copies.extend(group.windows(2).filter(is_copy).map(|pair| pair[1]));
+        }
+        if copies.is_empty() {
+            return;
+        }
+        self.dropped.duplicates += copies.len() as u64;
+        copies.sort_unstable();
+        let mut copies = copies.into_iter().peekable();
+        let mut index = 0;
+        self.triangles.retain(|_| {
+            let is_copy = copies.next_if_eq(&index).is_some();
+            index += 1;
+            !is_copy
+        });
+    }
+
     fn finish(
-        self,
+        mut self,
         vertices: impl FnOnce(Vec<[T; 3]>) -> MeshVertices,
     ) -> Result<MeshFile, MeshError> {
         if self.triangles.is_empty() {
             return Err(MeshFault::Empty.of_file());
         }
+        self.vertex_table = HashTable::new();
+        self.drop_copies();
         let (mut kept, mut triangles) = (self.vertices, self.triangles);
-        drop((self.vertex_table, self.triangle_table));
         kept.shrink_to_fit();
         triangles.shrink_to_fit();
         Ok(MeshFile {

@@ -1031,53 +1031,71 @@ impl<'t> Reader<'t> {
         }
     }
 
-    /// Loads every image once.
+    /// Reads every image once, whatever its paths.
     fn read_textures(&mut self, resolve: &Resolve<'_>) {
-        let mut known: HashMap<&[u8], Option<u32>> = HashMap::new();
+        let (scene, report) = (&mut self.scene, &mut self.blocks.report);
+        let mut by_path: HashMap<&[u8], Option<u32>> = HashMap::new();
+        let mut by_content: HashMap<blake3::Hash, u32> = HashMap::new();
         for (material, name) in std::mem::take(&mut self.texture_names) {
-            let index = *known.entry(name.bytes).or_insert_with(|| {
-                let path = String::from_utf8_lossy(name.bytes).into_owned();
-                match resolve(&path).map_err(|error| error.to_string()).and_then(|bytes| {
-                    texture::read_texture(&path, &bytes).map_err(|error| error.to_string())
-                }) {
-                    Ok(texture) => {
-                        self.scene.textures.push(texture);
-                        Some(self.scene.textures.len() as u32 - 1)
+            let index = *by_path.entry(name.bytes).or_insert_with(|| {
+                let path = String::from_utf8_lossy(name.bytes);
+                let mut read = || {
+                    let bytes = resolve(&path).map_err(|error| error.to_string())?;
+                    let hash = blake3::hash(&bytes);
+                    if let Some(&index) = by_content.get(&hash) {
+                        return Ok(index);
                     }
-                    Err(error) => {
-                        self.blocks.report.error(name.span(), || {
-                            format!("cannot read the texture {}: {error}", shown(name.bytes))
-                        });
-                        None
-                    }
-                }
+                    let texture =
+                        texture::read_texture(&path, &bytes).map_err(|error| error.to_string())?;
+                    let index = scene.textures.len() as u32;
+                    scene.textures.push(texture);
+                    by_content.insert(hash, index);
+                    Ok(index)
+                };
+                let told = |error: String| {
+                    report.error(name.span(), || {
+                        format!("cannot read the texture {}: {error}", shown(name.bytes))
+                    });
+                };
+                read().map_err(told).ok()
             });
-            self.scene.materials[material as usize].texture = index;
+            scene.materials[material as usize].texture = index;
         }
     }
 
-    /// Reads every mesh file once.
+    /// Reads every mesh file once, whatever its paths.
     fn read_meshes(&mut self, resolve: &Resolve<'_>) {
-        let mut known: HashMap<String, Arc<MeshShape>> = HashMap::new();
-        for (mesh, words) in self.scene.meshes.iter_mut().zip(&self.mesh_words) {
-            if let Some(shape) = known.get(&mesh.path) {
-                mesh.shape = Arc::clone(shape);
-                continue;
-            }
-            let file = resolve(&mesh.path).map_err(|error| error.to_string()).and_then(|bytes| {
-                mesh_file::read_mesh(&mesh.path, &bytes).map_err(|error| error.to_string())
+        let (scene, report) = (&mut self.scene, &mut self.blocks.report);
+        let mut by_path: HashMap<&[u8], Option<Arc<MeshShape>>> = HashMap::new();
+        let mut by_content: HashMap<blake3::Hash, Arc<MeshShape>> = HashMap::new();
+        for (mesh, words) in scene.meshes.iter_mut().zip(&self.mesh_words) {
+            let name = words.file;
+            let shape = by_path.entry(name.bytes).or_insert_with(|| {
+                let path = String::from_utf8_lossy(name.bytes);
+                let mut read = || {
+                    let bytes = resolve(&path).map_err(|error| error.to_string())?;
+                    let hash = blake3::hash(&bytes);
+                    if let Some(shape) = by_content.get(&hash) {
+                        return Ok(Arc::clone(shape));
+                    }
+                    let MeshFile { shape, dropped } =
+                        mesh_file::read_mesh(&path, &bytes).map_err(|error| error.to_string())?;
+                    scene.dropped.zero_area += dropped.zero_area;
+                    scene.dropped.duplicates += dropped.duplicates;
+                    let shape = Arc::new(shape);
+                    by_content.insert(hash, Arc::clone(&shape));
+                    Ok(shape)
+                };
+                let told = |error: String| {
+                    report.error(name.span(), || {
+                        format!("cannot read the mesh {}: {error}", shown(name.bytes))
+                    });
+                };
+                read().map_err(told).ok()
             });
-            match file {
-                Ok(MeshFile { shape, dropped }) => {
-                    mesh.shape = Arc::new(shape);
-                    self.scene.dropped.zero_area += dropped.zero_area;
-                    self.scene.dropped.duplicates += dropped.duplicates;
-                }
-                Err(error) => self.blocks.report.error(words.file.span(), || {
-                    format!("cannot read the mesh {}: {error}", shown(words.file.bytes))
-                }),
+            if let Some(shape) = shape {
+                mesh.shape = Arc::clone(shape);
             }
-            known.insert(mesh.path.clone(), Arc::clone(&mesh.shape));
         }
     }
 

@@ -451,7 +451,7 @@ mod tests {
     }
 
     fn triangle(k: usize) -> String {
-        let material = if k % 3 == 0 { "a" } else { "b" };
+        let material = ["a", "b", "b"][k % 3];
         format!(
             "triangle\n\tvertex 0 0 {k}\n\tvertex 1 0 {k}.5\n\tvertex 0 1 {k}e-1\n\tmaterial {material}\nendtriangle\n"
         )

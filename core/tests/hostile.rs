@@ -52,13 +52,13 @@ fn garbage_is_refused() {
 
 #[test]
 fn unknown_words_do_not_each_search_the_whole_file() {
-    let words: String = (0..200_000).map(|k| format!("w{k}\n")).collect();
+    let words = (0..200_000).map(|k| format!("w{k}\n")).collect::<Vec<_>>().concat();
     assert!(read(words.as_bytes()).scene.is_none());
     assert!(
         read(format!("geometry\n{words}endgeometry").as_bytes()).scene.is_some(),
         "all are skipped"
     );
-    let blocks: String = (0..200_000).map(|k| format!("w{k} endw{k}\n")).collect();
+    let blocks = (0..200_000).map(|k| format!("w{k} endw{k}\n")).collect::<Vec<_>>().concat();
     let reading = read(format!("geometry\n{blocks}endgeometry").as_bytes());
     assert_eq!(reading.omitted.warnings, 199_900);
 }
@@ -79,8 +79,10 @@ fn depth_takes_no_stack() {
 
 #[test]
 fn a_line_of_many_materials_has_its_places_found_in_one_walk() {
-    let entries: String =
-        (0..100_000).map(|k| format!("entry name m{k} alpha 1 endentry ")).collect();
+    let entries = (0..100_000)
+        .map(|k| format!("entry name m{k} alpha 1 endentry "))
+        .collect::<Vec<_>>()
+        .concat();
     let scene = read(format!("materials {entries} endmaterials").as_bytes()).scene.unwrap();
     assert!(scene.materials[99_999].places.alpha.unwrap().column > 3_000_000);
 }

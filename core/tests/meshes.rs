@@ -1,5 +1,7 @@
 //! Mesh files of all formats against the shapes that they give.
 
+use std::fmt::Write;
+
 use rtfarm_core::{
     mesh_file::{MeshFault, read_mesh},
     scene::{Dropped, MeshShape, MeshVertices},
@@ -52,7 +54,7 @@ fn ascii_stl(facets: &[[[f32; 3]; 3]]) -> String {
     for facet in facets {
         text += " facet normal 0 0 0\n  outer loop\n";
         for [x, y, z] in facet {
-            text += &format!("   vertex {x:e} {y} {z:e}\n");
+            writeln!(text, "   vertex {x:e} {y} {z:e}").unwrap();
         }
         text += "  endloop\n endfacet\n";
     }
@@ -304,8 +306,11 @@ fn counts_take_no_memory_before_they_are_checked() {
 
 #[test]
 fn a_face_of_too_many_corners_is_refused() {
-    let zigzag: String = (0..2000).map(|k| format!("v {k} {} 0\n", k % 2)).collect();
-    let face: String = (1..=2000).map(|k| format!(" {k}")).collect();
+    let (mut zigzag, mut face) = (String::new(), String::new());
+    for k in 0..2000 {
+        writeln!(zigzag, "v {k} {} 0", k % 2).unwrap();
+        write!(face, " {}", k + 1).unwrap();
+    }
     check_error(
         "a.obj",
         format!("{zigzag}v 3000 -3000 0\nf{face} 2001"),
