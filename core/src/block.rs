@@ -128,6 +128,15 @@ impl Block {
         }
     }
 
+    /// Whether it holds fields only.
+    fn is_leaf(self) -> bool {
+        !self.is_operation()
+            && !matches!(
+                self,
+                Self::File | Self::Viewport | Self::Materials | Self::Lights | Self::Geometry
+            )
+    }
+
     /// Whether it joins solids.
     pub(crate) fn is_operation(self) -> bool {
         matches!(self, Self::Union | Self::Intersection | Self::Difference)
@@ -248,6 +257,8 @@ pub(crate) struct Blocks<'t> {
     open_counts: [usize; 18],
     /// The field that was read last in the innermost block and how many numbers it takes.
     last_field: Option<(Word<'t>, usize)>,
+    /// Its value.
+    value_span: Range<usize>,
     /// Bytes that may still be looked through for the end of unknown blocks. Without a limit
     /// each of a million unknown words could look through the whole file.
     look_ahead: usize,
@@ -262,6 +273,7 @@ impl<'t> Blocks<'t> {
             open: Vec::new(),
             open_counts: [0; 18],
             last_field: None,
+            value_span: 0..0,
             look_ahead: text.len().saturating_add(1 << 16),
         }
     }
@@ -315,12 +327,14 @@ impl<'t> Blocks<'t> {
                     return None;
                 }
                 self.lexer.go_to(word.end);
+                if block.is_leaf() {
+                    self.report_wrong_end(&word);
+                    self.leave();
+                    return None;
+                }
                 self.report.error(word.span(), || {
-                    format!(
-                        "no {} is open that {} could end",
-                        shown(ended.word().as_bytes()),
-                        shown(word.bytes)
-                    )
+                    let ended = shown(ended.word().as_bytes());
+                    format!("no {ended} is open that {} could end", shown(word.bytes))
                 });
                 continue;
             }
@@ -362,6 +376,17 @@ impl<'t> Blocks<'t> {
             } else {
                 return Some(word);
             }
+        }
+    }
+
+    /// A leaf that is ended by another's word: whoever ends something means what is open.
+    fn report_wrong_end(&mut self, word: &Word<'t>) {
+        if let Some(&(block, opening)) = self.open.last() {
+            self.report.error_with(
+                word.span(),
+                || format!("{} cannot end this: `{}` does", shown(word.bytes), block.end()),
+                || Some((opening.span(), "opened here".into())),
+            );
         }
     }
 
@@ -435,32 +460,58 @@ impl<'t> Blocks<'t> {
         let hint = || {
             let inner =
                 OPENED.iter().filter(|inner| inner.stands_in(block)).map(|inner| inner.word());
-            suggestion(word.bytes, block.fields().iter().copied().chain(inner))
-                .map(|guess| format!("; did you mean `{guess}`?"))
+            if let Some(guess) = suggestion(word.bytes, block.fields().iter().copied().chain(inner))
+            {
+                return format!("; did you mean `{guess}`?");
+            }
+            let homes: Vec<_> = OPENED
+                .iter()
+                .filter(|home| home.fields().iter().any(|field| field.as_bytes() == word.bytes))
+                .map(|home| format!("`{}`", home.word()))
+                .take(4)
+                .collect();
+            match (block, &homes[..]) {
+                (Block::Union | Block::Intersection | Block::Difference, _)
+                    if word.bytes == b"material" =>
+                {
+                    "; each of the solids has its own".into()
+                }
+                (_, []) => String::new(),
+                (_, [home]) => format!("; it belongs in {home}"),
+                (_, [others @ .., last]) => {
+                    format!("; it belongs in {} or {last}", others.join(", "))
+                }
+            }
         };
         match (block, is_block) {
-            (Block::File, false) => self.report.error(word.span(), || {
-                let sections = || {
-                    ": a file consists of `viewport`, `materials`, `lights` and `geometry`".into()
-                };
-                format!(
-                    "{} begins no section{}",
-                    shown(word.bytes),
-                    hint().unwrap_or_else(sections)
-                )
+            (Block::File, false) => self.report.error(word.span(), || match hint() {
+                hint if hint.is_empty() => format!(
+                    "{} begins no section: a file consists of `viewport`, `materials`, `lights` and `geometry`",
+                    shown(word.bytes)
+                ),
+                hint => format!("{} begins no section{hint}", shown(word.bytes)),
             }),
             (_, true) => self.report.warn(word.span(), || {
-                let hint = hint().unwrap_or_default();
-                format!("the block {} is unknown and skipped{hint}", shown(word.bytes))
+                format!("the block {} is unknown and skipped{}", shown(word.bytes), hint())
             }),
-            (_, false) => self.report.warn(word.span(), || {
-                let hint = hint().unwrap_or_default();
-                format!(
-                    "`{}` knows no {}; skipped to the end of the line{hint}",
-                    block.word(),
-                    shown(word.bytes)
-                )
-            }),
+            (_, false) => {
+                let last_field =
+                    self.last_field.filter(|(field, _)| self.is_on_one_line(field.end..word.start));
+                self.report.warn(word.span(), || {
+                    let unknown = shown(word.bytes);
+                    match last_field {
+                        Some((field, count)) => {
+                            let values = match count {
+                                0 => "one word".into(),
+                                1 => "one number".into(),
+                                _ => format!("{count} numbers"),
+                            };
+                            format!("{} takes {values}; from {unknown} on the line is skipped", shown(field.bytes))
+                        }
+                        None => format!("{unknown} is not known in `{}`, and its line is skipped{}", block.word(), hint()),
+                    }
+                });
+            }
         }
     }
 
@@ -511,6 +562,7 @@ impl<'t> Blocks<'t> {
         let mut numbers = [0.0; N];
         let mut is_sound = true;
         let mut end = field.end;
+        self.value_span = field.span();
         for (count, number) in numbers.iter_mut().enumerate() {
             let Some(word) = self.lexer.peek().filter(|word| self.is_value(word, end)) else {
                 if is_sound {
@@ -520,11 +572,12 @@ impl<'t> Blocks<'t> {
             };
             self.lexer.go_to(word.end);
             end = word.end;
+            self.value_span = if count == 0 { word.start } else { self.value_span.start }..end;
             match word.number() {
                 Some(value) if value.is_finite() => *number = value,
                 _ if is_sound => {
                     is_sound = false;
-                    self.report_bad_number(&word);
+                    self.report_bad_number(&word, N);
                 }
                 _ => {}
             }
@@ -537,9 +590,15 @@ impl<'t> Blocks<'t> {
         self.numbers::<1>(field).map(|[number]| number)
     }
 
-    /// Whether the next word can only be a number.
-    pub(crate) fn is_number_next(&self) -> bool {
-        self.lexer.peek().is_some_and(|word| word.is_number_like())
+    /// How many of the next two words can only be numbers.
+    pub(crate) fn numbers_that_follow(&self) -> usize {
+        let mut ahead = self.lexer.clone();
+        std::iter::from_fn(|| ahead.next()).take(2).take_while(Word::is_number_like).count()
+    }
+
+    /// Where the numbers stand that were read last.
+    pub(crate) fn value_span(&self) -> Range<usize> {
+        self.value_span.clone()
     }
 
     /// Whether a word behind byte `end` is meant as a value: anything on the same line but a
@@ -568,7 +627,8 @@ impl<'t> Blocks<'t> {
         });
     }
 
-    fn report_bad_number(&mut self, word: &Word<'t>) {
+    fn report_bad_number(&mut self, word: &Word<'t>, needed: usize) {
+        let field = self.last_field.map_or(*word, |(field, _)| field);
         self.report.error(word.span(), || {
             let shown = shown(word.bytes);
             if word.is_named_infinity_or_nan() {
@@ -595,7 +655,12 @@ impl<'t> Blocks<'t> {
                     "{shown} is no number: the decimal sign is a point, as in `{right}`"
                 );
             }
-            format!("{shown} is no number")
+            let numbers =
+                if needed == 1 { "one number".into() } else { format!("{needed} numbers") };
+            format!(
+                "{shown} is no number; {} takes {numbers}",
+                crate::diagnostic::shown(field.bytes)
+            )
         });
     }
 
@@ -628,20 +693,23 @@ impl<'t> Blocks<'t> {
         }
     }
 
-    /// Reports the words that follow a file name on its line: it wants quotes.
-    pub(crate) fn check_file_name_end(&mut self, name: Word<'t>) {
-        let Some(next) = self.lexer.peek() else { return };
-        if name.quotes == Quotes::Bare
-            && self.is_on_one_line(name.end..next.start)
-            && !is_keyword(&next)
-            && !next.is_ellipsis()
-        {
+    /// Whether a file name is all that stands on its line; if not, it wants quotes, and that is
+    /// reported.
+    pub(crate) fn ends_file_name(&mut self, name: Word<'t>) -> bool {
+        let is_continued = name.quotes == Quotes::Bare
+            && self.lexer.peek().is_some_and(|next| {
+                self.is_on_one_line(name.end..next.start)
+                    && !is_keyword(&next)
+                    && !next.is_ellipsis()
+            });
+        if is_continued {
             self.skip_line();
             let end = self.lexer.at();
             self.report.error(name.start..end, || {
                 "a file name with spaces stands in double quotes".into()
             });
         }
+        !is_continued
     }
 }
 

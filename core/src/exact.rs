@@ -74,8 +74,10 @@ fn turn(a: DVec2, b: DVec2, c: DVec2) -> Ordering {
 /// Why four points are no quadrangle.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) enum QuadrangleFault {
-    /// All on one line, or two in one place.
+    /// All are on one line.
     Degenerate,
+    /// Two are in one place.
+    SamePlace,
     /// Two sides meet where they should not.
     Crossing,
     /// The corners are `deviation` away from their plane, more than the `tolerance`.
@@ -92,9 +94,10 @@ pub(crate) enum QuadrangleFault {
 pub(crate) fn check_quadrangle(corners: [DVec3; 4]) -> Result<Option<f64>, QuadrangleFault> {
     let triples = [[0, 1, 2], [1, 2, 3], [2, 3, 0], [3, 0, 1]].map(|t| t.map(|k| corners[k]));
     let pairs = [(0, 1), (1, 2), (2, 3), (3, 0), (0, 2), (1, 3)];
-    if pairs.iter().any(|&(j, k)| corners[j] == corners[k])
-        || triples.iter().all(|&[a, b, c]| is_collinear(a, b, c))
-    {
+    if pairs.iter().any(|&(j, k)| corners[j] == corners[k]) {
+        return Err(QuadrangleFault::SamePlace);
+    }
+    if triples.iter().all(|&[a, b, c]| is_collinear(a, b, c)) {
         return Err(QuadrangleFault::Degenerate);
     }
 
@@ -372,13 +375,16 @@ mod tests {
 
     #[test]
     fn flat_quadrangles_are_degenerate() {
+        let on_a_line = [[0.0, 0.0, 0.0], [1.0, 1.0, 1.0], [2.0, 2.0, 2.0], [3.0, 3.0, 3.0]];
+        check_quadrangle_at_all_scales(on_a_line, |result| {
+            *result == Err(QuadrangleFault::Degenerate)
+        });
         for corners in [
-            [[0.0, 0.0, 0.0], [1.0, 1.0, 1.0], [2.0, 2.0, 2.0], [3.0, 3.0, 3.0]],
             [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]],
             [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 1.0, 0.0]],
         ] {
             check_quadrangle_at_all_scales(corners, |result| {
-                *result == Err(QuadrangleFault::Degenerate)
+                *result == Err(QuadrangleFault::SamePlace)
             });
         }
     }

@@ -93,7 +93,7 @@ pub enum MeshFault {
     #[error("a face that is not convex has at most {most} corners", most = polygon::MOST_CORNERS)]
     ManyCorners,
     /// An index that no vertex has.
-    #[error("no vertex has the number {index}: {count} are there")]
+    #[error("there is no vertex {index}: the file has {count}")]
     Index {
         /// As the file counts.
         index: i64,

@@ -63,7 +63,10 @@ impl Reading {
 /// let nothing = |_: &str| Err(std::io::ErrorKind::NotFound.into());
 /// let reading = read_scene(b"geometry\n  sphere coords 0 0 0 radius -1 endsphere\nendgeometry", &nothing);
 /// let told: Vec<_> = reading.diagnostics.iter().map(|d| format!("{}: {}", d.at, d.message)).collect();
-/// assert_eq!(told, ["2:3: this `sphere` has no `material`", "2:23: the radius is above 0, not -1"]);
+/// assert_eq!(
+///     told,
+///     ["2:3: this `sphere` has no `material`", "2:30: `radius` must be above 0, but is -1"]
+/// );
 /// ```
 pub fn read_scene(text: &[u8], resolve: &Resolve<'_>) -> Reading {
     read_scene_in_pieces(text, resolve, triangles::PIECE)
@@ -246,7 +249,7 @@ impl<'t> Reader<'t> {
             }
             b"xres" | b"yres" => {
                 self.warn_synonym(word, "`size` in `viewport`");
-                let side = self.blocks.number(word).and_then(|side| self.side(word, side));
+                let side = self.blocks.number(word).and_then(|side| self.side(side));
                 let field = if word.bytes == b"xres" { &mut self.width } else { &mut self.height };
                 field.set(&mut self.blocks.report, word, side);
             }
@@ -259,17 +262,17 @@ impl<'t> Reader<'t> {
         let sides = self
             .blocks
             .numbers(word)
-            .and_then(|[width, height]| Some((self.side(word, width)?, self.side(word, height)?)));
+            .and_then(|[width, height]| Some((self.side(width)?, self.side(height)?)));
         self.width.set(&mut self.blocks.report, word, sides.map(|(width, _)| width));
         self.height.word = Some(word);
         self.height.value = sides.map(|(_, height)| height);
     }
 
     /// A side of the picture in pixels.
-    fn side(&mut self, word: Word<'t>, side: f64) -> Option<u32> {
+    fn side(&mut self, side: f64) -> Option<u32> {
         let is_sound = side.fract() == 0.0 && (1.0..=f64::from(Size::MAX_SIDE)).contains(&side);
         if !is_sound {
-            self.report().error(word.span(), || {
+            self.refuse_value(|| {
                 format!(
                     "a picture's sides are whole numbers from 1 to {}, not {side}",
                     Size::MAX_SIDE
@@ -279,16 +282,25 @@ impl<'t> Reader<'t> {
         is_sound.then_some(side as u32)
     }
 
+    /// Reports that the value that was read last cannot be used.
+    fn refuse_value(&mut self, message: impl FnOnce() -> String) {
+        let span = self.blocks.value_span();
+        self.report().error(span, message);
+    }
+
     /// A colour where 255 is 1, that may be brighter but not negative.
     fn color(&mut self, word: Word<'t>) -> Option<DVec3> {
-        let color = self.blocks.numbers::<3>(word)?;
-        if let Some(negative) = color.into_iter().find(|&part| part < 0.0) {
-            self.report().error(word.span(), || {
-                format!("the parts of {} are not below 0, as {negative} is", shown(word.bytes))
+        let color = DVec3::from(self.blocks.numbers(word)?);
+        let is_color = color.min_element() >= 0.0;
+        if !is_color {
+            self.refuse_value(|| {
+                format!(
+                    "the parts of a colour must be 0 or more, but one is {}",
+                    color.min_element()
+                )
             });
-            return None;
         }
-        Some(DVec3::from(color) / 255.0)
+        is_color.then_some(color / 255.0)
     }
 
     fn warn_synonym(&mut self, word: Word<'t>, instead: &str) {
@@ -317,16 +329,15 @@ impl<'t> Reader<'t> {
                     name.set(&mut self.blocks.report, word, value);
                 }
                 b"color" => {
-                    let value =
-                        self.blocks.numbers(word).map(|parts| self.clamp_color(word, parts));
+                    let value = self.blocks.numbers(word).map(|parts| self.clamp_color(parts));
                     color.set(&mut self.blocks.report, word, value);
                 }
                 b"alpha" => {
-                    let value = self.blocks.number(word).map(|value| self.clamp_alpha(word, value));
+                    let value = self.blocks.number(word).map(|value| self.clamp_alpha(value));
                     alpha.set(&mut self.blocks.report, word, value);
                 }
                 b"reflect" => {
-                    let value = self.blocks.number(word).and_then(|value| self.share(word, value));
+                    let value = self.blocks.number(word).and_then(|value| self.share(value));
                     reflect.set(&mut self.blocks.report, word, value);
                 }
                 b"refract" => {
@@ -359,7 +370,7 @@ impl<'t> Reader<'t> {
         if !is_identifier(name.bytes) {
             self.report().warn(name.span(), || {
                 format!(
-                    "{} is no name: letters, digits and `_`, no digit first; taken as it is",
+                    "{} is no C++ identifier (letters, digits and `_`, no digit first); taken as it is",
                     shown(name.bytes)
                 )
             });
@@ -384,10 +395,11 @@ impl<'t> Reader<'t> {
         );
     }
 
-    fn clamp_color(&mut self, word: Word<'t>, parts: [f64; 3]) -> DVec3 {
+    fn clamp_color(&mut self, parts: [f64; 3]) -> DVec3 {
         let clamped = parts.map(|part| part.clamp(0.0, 255.0));
         if parts.iter().any(|part| !(0.0..=255.0).contains(part)) {
-            self.report().warn(word.span(), || {
+            let span = self.blocks.value_span();
+            self.report().warn(span, || {
                 let [r, g, b] = clamped;
                 format!("the parts of a colour are from 0 to 255; taken as {r} {g} {b}")
             });
@@ -395,10 +407,11 @@ impl<'t> Reader<'t> {
         DVec3::from(clamped) / 255.0
     }
 
-    fn clamp_alpha(&mut self, word: Word<'t>, alpha: f64) -> f64 {
+    fn clamp_alpha(&mut self, alpha: f64) -> f64 {
         let clamped = alpha.clamp(0.0, 1.0);
         if !(0.0..=1.0).contains(&alpha) {
-            self.report().warn(word.span(), || {
+            let span = self.blocks.value_span();
+            self.report().warn(span, || {
                 format!("alpha is from 0, clear, to 1, opaque; {alpha} is taken as {clamped}")
             });
         }
@@ -406,19 +419,18 @@ impl<'t> Reader<'t> {
     }
 
     /// The mirrored share, or a percentage of it.
-    fn share(&mut self, word: Word<'t>, reflect: f64) -> Option<f64> {
+    fn share(&mut self, reflect: f64) -> Option<f64> {
         match reflect {
             0.0..=1.0 => Some(reflect),
             1.0..=100.0 => {
-                let share = reflect / 100.0;
-                self.report().warn(word.span(), || {
+                let (share, span) = (reflect / 100.0, self.blocks.value_span());
+                self.report().warn(span, || {
                     format!("reflect is from 0 to 1; {reflect} is read as percent, {share}")
                 });
                 Some(share)
             }
             _ => {
-                self.report()
-                    .error(word.span(), || format!("reflect is from 0 to 1, not {reflect}"));
+                self.refuse_value(|| format!("reflect must be from 0 to 1, but is {reflect}"));
                 None
             }
         }
@@ -426,24 +438,23 @@ impl<'t> Reader<'t> {
 
     fn not_negative(&mut self, word: Word<'t>, value: f64) -> Option<f64> {
         if value < 0.0 {
-            self.report()
-                .error(word.span(), || format!("{} is not below 0, as {value} is", plain(word)));
+            self.refuse_value(|| {
+                format!("{} must be 0 or more, but is {value}", shown(word.bytes))
+            });
         }
         (value >= 0.0).then_some(value)
     }
 
     fn above_zero(&mut self, word: Word<'t>, value: f64) -> Option<f64> {
         if value <= 0.0 {
-            self.report()
-                .error(word.span(), || format!("the {} is above 0, not {value}", plain(word)));
+            self.refuse_value(|| format!("{} must be above 0, but is {value}", shown(word.bytes)));
         }
         (value > 0.0).then_some(value)
     }
 
     fn file_name(&mut self, word: Word<'t>) -> Option<Word<'t>> {
         let name = self.blocks.value_word(word, "a file name")?;
-        self.blocks.check_file_name_end(name);
-        Some(name)
+        self.blocks.ends_file_name(name).then_some(name)
     }
 
     fn read_lights(&mut self, opening: Word<'t>) {
@@ -453,14 +464,7 @@ impl<'t> Reader<'t> {
                 b"reference" => self.read_reference(word),
                 b"point" => self.read_point(word),
                 b"ambient" => {
-                    let first = self.blocks.number(word);
-                    let light = match first {
-                        Some(first) if self.blocks.is_number_next() => {
-                            self.blocks.numbers(word).map(|[g, b]| DVec3::new(first, g, b) / 255.0)
-                        }
-                        first => first.map(DVec3::splat),
-                    };
-                    let light = light.filter(|light| self.is_light(word, *light));
+                    let light = self.read_ambient(word);
                     self.ambient.set(&mut self.blocks.report, word, light);
                 }
                 b"backlight" => {
@@ -473,12 +477,25 @@ impl<'t> Reader<'t> {
         }
     }
 
-    fn is_light(&mut self, word: Word<'t>, light: DVec3) -> bool {
-        let is_light = light.min_element() >= 0.0;
-        if !is_light {
-            self.report().error(word.span(), || format!("{} is not below 0", plain(word)));
+    /// Reads one number, or the three of a colour.
+    fn read_ambient(&mut self, word: Word<'t>) -> Option<DVec3> {
+        let first = self.blocks.number(word)?;
+        let light = match self.blocks.numbers_that_follow() {
+            0 => DVec3::splat(first),
+            1 => {
+                self.refuse_value(|| {
+                    "`ambient` takes one number or three, but two stand here".into()
+                });
+                self.blocks.number(word);
+                return None;
+            }
+            _ => self.blocks.numbers(word).map(|[g, b]| DVec3::new(first, g, b) / 255.0)?,
+        };
+        if light.min_element() < 0.0 {
+            self.refuse_value(|| "ambient light must be 0 or more".into());
+            return None;
         }
-        is_light
+        Some(light)
     }
 
     fn read_reference(&mut self, opening: Word<'t>) {
@@ -739,14 +756,17 @@ impl<'t> Reader<'t> {
             Err(fault) => {
                 self.report().error(opening.span(), || match fault {
                     QuadrangleFault::Degenerate => {
-                        "this quadrangle has no area, or two vertices in one place".into()
+                        "this quadrangle has no area: its vertices are on one line".into()
+                    }
+                    QuadrangleFault::SamePlace => {
+                        "this quadrangle has two vertices in one place; three make a triangle".into()
                     }
                     QuadrangleFault::Crossing => {
-                        "the sides of this quadrangle cross or touch; its vertices go around once".into()
+                        "the sides of this quadrangle cross or touch; its vertices must stand in their order around it".into()
                     }
                     QuadrangleFault::NotPlanar { deviation, tolerance } => format!(
-                        "this quadrangle is not planar: its vertices are {deviation:.3e} off its plane, and \
-                         {tolerance:.3e} is the most; two triangles may be bent"
+                        "this quadrangle is not planar: its vertices are {deviation:.3e} off their plane, and \
+                         {tolerance:.3e} is the most; two triangles could be bent so"
                     ),
                 });
                 return;
@@ -820,7 +840,7 @@ impl<'t> Reader<'t> {
                         self.warn_synonym(word, "`texcoord`");
                     }
                     let value = self.blocks.numbers(word).map(DVec2::from);
-                    if word.bytes == b"textureCoord" && self.blocks.is_number_next() {
+                    if word.bytes == b"textureCoord" && self.blocks.numbers_that_follow() > 0 {
                         self.blocks.number(word); // The third of three coordinates.
                     }
                     is_sound &= value.is_some();
@@ -899,8 +919,7 @@ impl<'t> Reader<'t> {
                     let value = self.blocks.numbers(word).and_then(|[x, y, z, degrees]| {
                         let axis = DVec3::new(x, y, z);
                         if axis == DVec3::ZERO {
-                            self.report()
-                                .error(word.span(), || "the axis of `rotate` is not 0 0 0".into());
+                            self.refuse_value(|| "the axis of `rotate` must not be 0 0 0".into());
                         }
                         (axis != DVec3::ZERO).then_some((axis, degrees))
                     });

@@ -47,10 +47,10 @@ pub const LONGEST_SIDE: u32 = 65_535;
 pub const MOST_TEXELS: u64 = 1 << 28;
 
 /// Texels that any file may have, however short.
-const HARMLESS_TEXELS: u64 = 1 << 24;
+const HARMLESS_TEXELS: u64 = 1 << 22;
 
-/// Texels that a longer file may have for each of its bytes.
-const MOST_TEXELS_A_BYTE: u64 = 100;
+/// Texels that a longer file may have for each of its bytes. A PNG of one colour has 344.
+const MOST_TEXELS_A_BYTE: u64 = 400;
 
 /// The memory that a decoder may take besides.
 const MOST_BYTES: u64 = 1 << 30;

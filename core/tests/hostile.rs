@@ -119,7 +119,7 @@ fn absurd_numbers_are_refused() {
         ("-1e400", "`-1e400` is too large: numbers go up to about 1.8e308"),
         ("nan", "`nan` cannot be computed with; a finite number should stand here"),
         ("-Infinity", "`-Infinity` cannot be computed with; a finite number should stand here"),
-        ("1e-400", "the radius is above 0, not 0"),
+        ("1e-400", "`radius` must be above 0, but is 0"),
         (
             "1e99999999999999999999",
             "`1e99999999999999999999` is too large: numbers go up to about 1.8e308",

@@ -167,17 +167,17 @@ fn broken_obj_is_refused_at_its_line() {
     check_error(
         "a.obj",
         format!("{square}f 1 2 5"),
-        "line 5: no vertex has the number 5: 4 are there",
+        "line 5: there is no vertex 5: the file has 4",
     );
     check_error(
         "a.obj",
         format!("{square}f 1 2 -5"),
-        "line 5: no vertex has the number -5: 4 are there",
+        "line 5: there is no vertex -5: the file has 4",
     );
     check_error(
         "a.obj",
         format!("{square}f 0 1 2"),
-        "line 5: no vertex has the number 0: 4 are there",
+        "line 5: there is no vertex 0: the file has 4",
     );
     check_error("a.obj", format!("{square}f 1 2"), "line 5: a face has 3 corners or more, not 2");
     check_error("a.obj", format!("{square}f 1 2 x"), "line 5: a finite number should stand here");
@@ -263,7 +263,7 @@ fn broken_ply_is_refused_at_its_place() {
     check_error(
         "a.ply",
         text.replace("7 3 0 1 2", "7 3 0 1 4"),
-        "line 19: no vertex has the number 4: 4 are there",
+        "line 19: there is no vertex 4: the file has 4",
     );
     check_error(
         "a.ply",
