@@ -18,6 +18,7 @@ pub mod prepared;
 pub mod read;
 pub mod render;
 pub mod scene;
+mod shapes;
 mod stl;
 mod symbol;
 pub mod texture;
