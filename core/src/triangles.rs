@@ -120,27 +120,29 @@ impl Triangles {
         primitive: &mut u64,
         symbols: &mut Symbols<'t>,
     ) -> usize {
+        if (Scanner { text, at }).triangle().is_none() {
+            return at;
+        }
         let key = self.key;
-        let count = if at < self.parallel_from {
-            1
-        } else {
-            PIECES_A_THREAD * rayon::current_num_threads()
-        };
+        let threads = rayon::current_num_threads();
+        if at < self.parallel_from || threads == 1 {
+            let piece = Piece::parse(text, at, at.saturating_add(piece), key);
+            return self.adopt(&[piece], primitive, symbols);
+        }
+        let count = PIECES_A_THREAD * threads;
         let mut window = Window::parse(text, at, piece, count, key);
         loop {
-            let next_start = window.next_start;
             let (adopted, next) = rayon::join(
-                || self.adopt(&window, primitive, symbols),
-                || next_start.map(|start| Window::parse(text, start, piece, count, key)),
+                || self.adopt(&window.pieces, primitive, symbols),
+                || window.is_whole.then(|| Window::parse(text, window.end, piece, count, key)),
             );
+            if adopted < window.end {
+                // Up to two windows were parsed in vain: read twice as far before trying again.
+                self.parallel_from = adopted.saturating_add(4 * count * piece);
+            }
             match next {
-                Some(next) if next_start == Some(adopted) => window = next,
-                Some(_) => {
-                    // Up to two windows were parsed in vain: read twice as far before trying again.
-                    self.parallel_from = adopted.saturating_add(4 * count * piece);
-                    return adopted;
-                }
-                None => return adopted,
+                Some(next) if window.end == adopted => window = next,
+                _ => return adopted,
             }
         }
     }
@@ -149,12 +151,12 @@ impl Triangles {
     /// have given; the answer is where that ends.
     fn adopt<'t>(
         &mut self,
-        window: &Window<'t>,
+        pieces: &[Piece<'t>],
         primitive: &mut u64,
         symbols: &mut Symbols<'t>,
     ) -> usize {
-        let mut at = window.pieces[0].start;
-        for piece in &window.pieces {
+        let mut at = pieces[0].start;
+        for piece in pieces {
             if piece.start != at || *primitive + u64::from(piece.count) > u64::from(u32::MAX) {
                 break;
             }
@@ -186,31 +188,33 @@ const PIECES_A_THREAD: usize = 2;
 struct Window<'t> {
     /// At least one.
     pieces: Vec<Piece<'t>>,
-    /// Where the next window begins if all is plain up to there; `None` when nobody can tell.
-    next_start: Option<usize>,
+    /// Where the last piece ends if all is plain up to there.
+    end: usize,
+    /// Whether another window may begin at the end.
+    is_whole: bool,
 }
 
 impl<'t> Window<'t> {
     /// Parses up to `count` pieces from byte `at`.
     fn parse(text: &'t [u8], at: usize, piece: usize, count: usize, key: u64) -> Self {
-        let mut starts = vec![at];
-        while starts.len() < count + 1
-            && let Some(start) =
-                find_triangle_line(text, starts[starts.len() - 1].saturating_add(piece), piece)
+        let mut bounds = vec![at];
+        let mut end = at;
+        while bounds.len() <= count
+            && let Some(start) = find_triangle_line(text, end.saturating_add(piece), piece)
         {
-            starts.push(start);
+            bounds.push(start);
+            end = start;
         }
-        let is_whole = starts.len() == count + 1;
-        let next_start = (is_whole && count > 1).then(|| starts[count]);
+        let is_whole = bounds.len() > count;
         if !is_whole {
-            let last = starts[starts.len() - 1];
-            starts.push(last.saturating_add(piece).min(text.len()));
+            end = end.saturating_add(piece).min(text.len());
+            bounds.push(end);
         }
-        let pieces = starts
+        let pieces = bounds
             .par_windows(2)
             .map(|bounds| Piece::parse(text, bounds[0], bounds[1], key))
             .collect();
-        Self { pieces, next_start }
+        Self { pieces, end, is_whole }
     }
 }
 
@@ -246,14 +250,12 @@ struct Piece<'t> {
 impl<'t> Piece<'t> {
     /// Parses from `start`; no block begins at `end` or behind it.
     fn parse(text: &'t [u8], start: usize, end: usize, key: u64) -> Self {
-        // The shortest blocks that people write have some 100 bytes.
-        let expected = (end - start) / 128;
         let mut piece = Self {
             start,
             stop: start,
             count: 0,
-            triangles: Vec::with_capacity(expected),
-            hashes: Vec::with_capacity(expected),
+            triangles: Vec::new(),
+            hashes: Vec::new(),
             names: Vec::new(),
         };
         let mut scanner = Scanner { text, at: start };
