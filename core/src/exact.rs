@@ -348,6 +348,32 @@ mod tests {
     }
 
     #[test]
+    fn bounds_never_decide_what_whole_numbers_do_not() {
+        let mut state = 3;
+        let mut random = || {
+            state = crate::hash::mix(state + 1, 0x1234_5678_9abc_def1);
+            (state >> 11) as f64 / 2.0_f64.powi(53) - 0.5
+        };
+        let (mut flat, mut solid) = (0, 0);
+        for round in 0..20_000 {
+            let [a, u, v] = [(); 3].map(|()| DVec3::new(random(), random(), random()));
+            // Almost on the line and in the plane, and sometimes exactly.
+            let size = two_to(-10 * (round % 7));
+            let on_line = a + random() * u * size;
+            let in_plane = a + (random() * u + random() * v) * size;
+            let [p, q, r] = whole([a, a + u, on_line]).0;
+            let exactly = cross(&less(&q, &p), &less(&r, &p)).iter().all(is_zero);
+            assert_eq!(is_collinear(a, a + u, on_line), exactly);
+            let [p, q, r, s] = whole([a, a + u, a + v, in_plane]).0;
+            let exactly = is_zero(&dot(&cross(&less(&q, &p), &less(&r, &p)), &less(&s, &p)));
+            assert_eq!(is_coplanar(a, a + u, a + v, in_plane), exactly);
+            flat += usize::from(exactly);
+            solid += usize::from(!exactly);
+        }
+        assert!(flat > 0 && solid > 0, "{flat} {solid}");
+    }
+
+    #[test]
     fn simple_quadrangles_pass_at_any_scale() {
         for corners in [
             [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 0.0]],

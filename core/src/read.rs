@@ -208,6 +208,8 @@ impl<'t> Reader<'t> {
             corner.set(&mut self.blocks.report, word, value);
         }
         let report = &mut self.blocks.report;
+        let (eye_word, corner_word) =
+            (origin.word.unwrap_or(opening), top_left.word.unwrap_or(opening));
         let origin = origin.require(report, opening, "origin");
         let corners = [(top_left, "topleft"), (bottom_left, "bottomleft"), (top_right, "topright")]
             .map(|(corner, name)| corner.require(report, opening, name));
@@ -216,7 +218,7 @@ impl<'t> Reader<'t> {
                 (origin, corners)
         {
             let viewport = Viewport { eye, top_left, bottom_left, top_right };
-            check_viewport(&viewport, opening, report);
+            check_viewport(&viewport, eye_word, corner_word, report);
             self.scene.viewport = Some(viewport);
         }
         self.viewport.get_or_insert(opening);
@@ -774,22 +776,29 @@ fn is_other_format(text: &[u8]) -> bool {
     matches!(text, [0x1f, 0x8b, ..] | [0xff, 0xfe, ..] | [0xfe, 0xff, ..])
 }
 
-fn check_viewport(viewport: &Viewport, opening: Word<'_>, report: &mut Report) {
+fn check_viewport(
+    viewport: &Viewport,
+    eye_word: Word<'_>,
+    corner_word: Word<'_>,
+    report: &mut Report,
+) {
     let Viewport { eye, top_left, bottom_left, top_right } = *viewport;
     if exact::is_collinear(top_left, bottom_left, top_right) {
-        report.error(opening.span(), || "the three corners of the screen are on one line".into());
+        report
+            .error(corner_word.span(), || "the three corners of the screen are on one line".into());
     } else if exact::is_coplanar(top_left, bottom_left, top_right, eye) {
-        report.error(opening.span(), || "the eye, `origin`, is in the plane of the screen".into());
+        report.error(eye_word.span(), || "the eye, `origin`, is in the plane of the screen".into());
     } else if ![bottom_left - top_left, top_right - top_left, eye - top_left]
         .iter()
         .all(|edge| edge.is_finite())
     {
-        report.error(opening.span(), || "this viewport is too large to be computed with".into());
+        report
+            .error(corner_word.span(), || "this viewport is too large to be computed with".into());
     } else {
         let (left, top) = (direction(bottom_left - top_left), direction(top_right - top_left));
         let cosine = left.dot(top);
         if cosine.abs() > RIGHT_ANGLE {
-            report.warn(opening.span(), || {
+            report.warn(corner_word.span(), || {
                 "the screen is no rectangle: its edges at `topleft` are not at a right angle; rendered sheared"
                     .into()
             });

@@ -80,7 +80,7 @@ endviewport",
   bottomleft -1 -1 0
   topright -1 3 0
 endviewport",
-        &["1:1: error: the three corners of the screen are on one line"],
+        &["3:3: error: the three corners of the screen are on one line"],
     ),
     (
         "an eye in the plane of the screen",
@@ -90,7 +90,7 @@ endviewport",
   bottomleft -1 -1 0
   topright 1 1 0
 endviewport",
-        &["1:1: error: the eye, `origin`, is in the plane of the screen"],
+        &["2:3: error: the eye, `origin`, is in the plane of the screen"],
     ),
     (
         "a screen that is no rectangle",
@@ -101,7 +101,7 @@ endviewport",
   topright 1 1.5 0
 endviewport",
         &[
-            "1:1: warning: the screen is no rectangle: its edges at `topleft` are not at a right angle; rendered sheared",
+            "3:3: warning: the screen is no rectangle: its edges at `topleft` are not at a right angle; rendered sheared",
         ],
     ),
     (
