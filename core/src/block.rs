@@ -237,10 +237,17 @@ impl<'t, T> Field<'t, T> {
         self.value = value;
     }
 
-    /// The value; it is an error when the field was never set.
-    pub(crate) fn require(self, report: &mut Report, block: Word<'t>, field: &str) -> Option<T> {
-        if self.word.is_none() {
-            report.error(block.span(), || format!("this {} has no `{field}`", shown(block.bytes)));
+    /// The value; it is an error when the field was never set, unless the text is cut off.
+    pub(crate) fn require(
+        self,
+        blocks: &mut Blocks<'t>,
+        block: Word<'t>,
+        field: &str,
+    ) -> Option<T> {
+        if self.word.is_none() && !blocks.is_cut {
+            blocks
+                .report
+                .error(block.span(), || format!("this {} has no `{field}`", shown(block.bytes)));
         }
         self.value
     }
@@ -259,6 +266,8 @@ pub(crate) struct Blocks<'t> {
     last_field: Option<(Word<'t>, usize)>,
     /// Its value.
     value_span: Range<usize>,
+    /// Whether the text ended in the middle of a block, so that nobody knows what it lacks.
+    pub(crate) is_cut: bool,
     /// Bytes that may still be looked through for the end of unknown blocks. Without a limit
     /// each of a million unknown words could look through the whole file.
     look_ahead: usize,
@@ -274,6 +283,7 @@ impl<'t> Blocks<'t> {
             open_counts: [0; 18],
             last_field: None,
             value_span: 0..0,
+            is_cut: false,
             look_ahead: text.len().saturating_add(1 << 16),
         }
     }
@@ -304,6 +314,7 @@ impl<'t> Blocks<'t> {
             let block = self.innermost();
             let Some(word) = self.lexer.peek() else {
                 if let Some(&(_, opening)) = self.open.last() {
+                    self.is_cut = true;
                     self.report.error(opening.span(), || {
                         format!(
                             "this {} is never closed: `{}` is missing",

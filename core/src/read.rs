@@ -86,6 +86,8 @@ pub(crate) fn read_scene_in_pieces(text: &[u8], resolve: &Resolve<'_>, piece: us
 /// What has been read so far.
 pub(crate) struct Reader<'t> {
     pub(crate) text: &'t [u8],
+    /// Whether it is worth reading.
+    is_text: bool,
     pub(crate) piece: usize,
     pub(crate) blocks: Blocks<'t>,
     pub(crate) symbols: Symbols<'t>,
@@ -128,9 +130,10 @@ pub(crate) struct MeshWords<'t> {
 impl<'t> Reader<'t> {
     fn new(text: &'t [u8], piece: usize, textured: &[Vec<u8>]) -> Self {
         let mut report = Report::default();
-        check_encoding(text, &mut report);
+        let is_text = check_encoding(text, &mut report);
         Self {
             text,
+            is_text,
             piece,
             blocks: Blocks::new(text, report),
             symbols: Symbols::new(textured),
@@ -156,10 +159,9 @@ impl<'t> Reader<'t> {
     }
 
     fn read_file(&mut self) {
-        if is_other_format(self.text) {
-            return;
-        }
-        while let Some(word) = self.blocks.next() {
+        while self.is_text
+            && let Some(word) = self.blocks.next()
+        {
             match Block::opened_by(&word) {
                 Some(block @ Block::Viewport) => self.read_viewport(word, block),
                 Some(Block::Materials) => self.read_materials(word),
@@ -207,18 +209,17 @@ impl<'t> Reader<'t> {
             let value = self.blocks.numbers(word).map(DVec3::from);
             corner.set(&mut self.blocks.report, word, value);
         }
-        let report = &mut self.blocks.report;
         let (eye_word, corner_word) =
             (origin.word.unwrap_or(opening), top_left.word.unwrap_or(opening));
-        let origin = origin.require(report, opening, "origin");
+        let origin = origin.require(&mut self.blocks, opening, "origin");
         let corners = [(top_left, "topleft"), (bottom_left, "bottomleft"), (top_right, "topright")]
-            .map(|(corner, name)| corner.require(report, opening, name));
+            .map(|(corner, name)| corner.require(&mut self.blocks, opening, name));
         if self.viewport.is_none()
             && let (Some(eye), [Some(top_left), Some(bottom_left), Some(top_right)]) =
                 (origin, corners)
         {
             let viewport = Viewport { eye, top_left, bottom_left, top_right };
-            check_viewport(&viewport, eye_word, corner_word, report);
+            check_viewport(&viewport, eye_word, corner_word, &mut self.blocks.report);
             self.scene.viewport = Some(viewport);
         }
         self.viewport.get_or_insert(opening);
@@ -348,7 +349,7 @@ impl<'t> Reader<'t> {
                 _ => self.blocks.skip_unknown_keyword(word),
             }
         }
-        let name = name.require(&mut self.blocks.report, opening, "name");
+        let name = name.require(&mut self.blocks, opening, "name");
         let Some(name) = name else { return };
         let index = self.scene.materials.len() as u32;
         let symbol = self.symbols.symbol(name.bytes);
@@ -535,9 +536,8 @@ impl<'t> Reader<'t> {
                 _ => self.blocks.skip_unknown_keyword(word),
             }
         }
-        let report = &mut self.blocks.report;
-        let position = coords.require(report, opening, "coords");
-        let power = power.require(report, opening, "power");
+        let position = coords.require(&mut self.blocks, opening, "coords");
+        let power = power.require(&mut self.blocks, opening, "power");
         if let (Some(position), Some(power)) = (position, power) {
             self.lights.push(PointLight {
                 word: opening,
@@ -756,24 +756,29 @@ fn is_identifier(name: &[u8]) -> bool {
         && name.chars().next().is_some_and(|first| first == '_' || first.is_alphabetic())
 }
 
-/// Reports what makes the text no UTF-8.
-fn check_encoding(text: &[u8], report: &mut Report) {
+/// Reports what makes the text no UTF-8; whether its words may make sense all the same.
+fn check_encoding(text: &[u8], report: &mut Report) -> bool {
+    let head = &text[..text.len().min(1024)];
     if let [0x1f, 0x8b, ..] = text {
         report.error(0..2, || "this file is compressed by gzip; unpack it first".into());
-    } else if let [0xff, 0xfe, ..] | [0xfe, 0xff, ..] = text {
+        return false;
+    }
+    if let [0xff, 0xfe, ..] | [0xfe, 0xff, ..] = text {
         report.error(0..2, || "this file is in UTF-16; save it as UTF-8".into());
-    } else if let Err(error) = std::str::from_utf8(text) {
+        return false;
+    }
+    if let Some(at) = memchr::memchr(0, head) {
+        report.error(at..at + 1, || "a NUL byte stands here: this file is no text".into());
+        return false;
+    }
+    if let Err(error) = std::str::from_utf8(text) {
         let at = error.valid_up_to();
         let length = error.error_len().unwrap_or(text.len() - at);
         report.error(at..at + length, || {
             format!("the byte 0x{:02x} is no UTF-8; save the file as UTF-8", text[at])
         });
     }
-}
-
-/// Whether no word of the text can make sense.
-fn is_other_format(text: &[u8]) -> bool {
-    matches!(text, [0x1f, 0x8b, ..] | [0xff, 0xfe, ..] | [0xfe, 0xff, ..])
+    true
 }
 
 fn check_viewport(

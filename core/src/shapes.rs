@@ -106,7 +106,7 @@ impl<'t> Reader<'t> {
 
     fn finish_operation(&mut self, done: &OpenOperation<'t>, nodes: &mut Vec<SolidNode>) {
         let OpenOperation { opening, operation, operands } = *done;
-        if operands < 2 {
+        if operands < 2 && !self.blocks.is_cut {
             let found = if operands == 0 { "none" } else { "only one" };
             self.report().error(opening.span(), || {
                 format!(
@@ -178,10 +178,9 @@ impl<'t> Reader<'t> {
                 _ => self.blocks.skip_unknown_keyword(word),
             }
         }
-        let report = &mut self.blocks.report;
-        let center = coords.require(report, opening, "coords");
-        let radius = radius.require(report, opening, "radius");
-        let material = material.require(report, opening, "material");
+        let center = coords.require(&mut self.blocks, opening, "coords");
+        let radius = radius.require(&mut self.blocks, opening, "radius");
+        let material = material.require(&mut self.blocks, opening, "material");
         Some(Sphere { center: center?, radius: radius?, material: material?, primitive })
     }
 
@@ -326,9 +325,11 @@ impl<'t> Reader<'t> {
             }
         }
         if count < N {
-            self.report().error(opening.span(), || {
-                format!("a {shape} has {N} vertices, but this one has {count}")
-            });
+            if !self.blocks.is_cut {
+                self.report().error(opening.span(), || {
+                    format!("a {shape} has {N} vertices, but this one has {count}")
+                });
+            }
             is_sound = false;
         }
         let with_texcoords = texcoords.iter().filter(|texcoord| texcoord.word.is_some()).count();
@@ -340,7 +341,7 @@ impl<'t> Reader<'t> {
                 )
             });
         }
-        let material = material.require(&mut self.blocks.report, opening, "material")?;
+        let material = material.require(&mut self.blocks, opening, "material")?;
         let texcoords = (with_texcoords == N)
             .then(|| texcoords.map(|texcoord| texcoord.value.unwrap_or_default()));
         is_sound.then_some((vertices, texcoords, material))
@@ -390,8 +391,8 @@ impl<'t> Reader<'t> {
                 _ => self.blocks.skip_unknown_keyword(word),
             }
         }
-        let file = file.require(&mut self.blocks.report, opening, "file");
-        let material = material.require(&mut self.blocks.report, opening, "material");
+        let file = file.require(&mut self.blocks, opening, "file");
+        let material = material.require(&mut self.blocks, opening, "material");
         if let (Some(file), Some(material)) = (file, material) {
             self.mesh_words.push(MeshWords { opening, file });
             self.scene.meshes.push(Mesh {

@@ -99,6 +99,28 @@ fn texts_in_other_encodings_are_named() {
 }
 
 #[test]
+fn binary_files_are_named_and_not_read() {
+    let mut binary = b"solid\n".to_vec();
+    binary.resize(LONG, 0);
+    check_refused(&binary, "2:1", "a NUL byte stands here: this file is no text");
+    assert_eq!(read(&binary).diagnostics.len(), 1);
+}
+
+#[test]
+fn a_text_that_is_cut_off_lacks_its_ends_and_nothing_else() {
+    let reading = read(b"geometry\nunion\nsphere coords 0 0 0");
+    let told: Vec<_> = reading.diagnostics.iter().map(|d| d.message.as_str()).collect();
+    assert_eq!(
+        told,
+        [
+            "this `geometry` is never closed: `endgeometry` is missing",
+            "this `union` is never closed: `endunion` is missing",
+            "this `sphere` is never closed: `endsphere` is missing",
+        ]
+    );
+}
+
+#[test]
 fn unclosed_quotes_end_with_their_line() {
     check_refused(
         b"materials entry name a texture \"x.png\nendentry endmaterials",
