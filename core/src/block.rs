@@ -551,20 +551,19 @@ impl<'t> Blocks<'t> {
     /// Skips to the end of the line, or to a word on it that opens or ends a block here.
     fn skip_line(&mut self) {
         let block = self.innermost();
-        let line_end = {
-            let mut line = self.lexer.clone();
-            line.skip_line();
-            line.at()
+        let stops = |word: &Word<'t>| {
+            Block::ended_by(word).is_some_and(|ended| self.open_counts[ended as usize] > 0)
+                || Block::opened_by(word).is_some_and(|opened| opened.stands_in(block))
         };
-        while let Some(next) = self.lexer.peek().filter(|next| next.start < line_end) {
-            let stops = Block::ended_by(&next)
-                .is_some_and(|ended| self.open_counts[ended as usize] > 0)
-                || Block::opened_by(&next).is_some_and(|opened| opened.stands_in(block));
-            if stops {
-                return;
-            }
-            self.lexer.go_to(next.end);
+        let mut ahead = self.lexer.clone();
+        let mut end = ahead.at();
+        while let Some(word) = ahead.next()
+            && self.is_on_one_line(end..word.start)
+            && !stops(&word)
+        {
+            end = word.end;
         }
+        self.lexer.go_to(end);
     }
 
     /// Reads the `N` numbers of a field; `None` when that failed and was reported.

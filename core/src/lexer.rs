@@ -182,11 +182,11 @@ impl<'t> Lexer<'t> {
 
     fn quoted_word(&mut self, start: usize) -> Word<'t> {
         let rest = &self.text[start + 1..];
-        let line = &rest[..memchr::memchr(b'\n', rest).unwrap_or(rest.len())];
-        let (bytes, end, quotes) = if let Some(length) = memchr::memchr(b'"', line) {
-            (&line[..length], start + length + 2, Quotes::Closed)
+        let length = memchr::memchr2(b'"', b'\n', rest).unwrap_or(rest.len());
+        let (bytes, end, quotes) = if rest.get(length) == Some(&b'"') {
+            (&rest[..length], start + length + 2, Quotes::Closed)
         } else {
-            let line = line.strip_suffix(b"\r").unwrap_or(line);
+            let line = rest[..length].strip_suffix(b"\r").unwrap_or(&rest[..length]);
             (line, start + 1 + line.len(), Quotes::Open)
         };
         self.at = end;

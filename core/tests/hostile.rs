@@ -64,6 +64,20 @@ fn unknown_words_do_not_each_search_the_whole_file() {
 }
 
 #[test]
+fn long_lines_are_not_searched_for_every_word() {
+    for unit in [
+        "fog 1 sphere coords 0 0 0 radius 1 material a endsphere ",
+        "triangle vertex \"x\" 0 endtriangle ",
+        "mesh file my bottle.stl endmesh ",
+        "\"a\" ",
+        "sphere endspere ",
+    ] {
+        let text = format!("geometry {} endgeometry", unit.repeat(LONG / unit.len()));
+        assert!(read(text.as_bytes()).scene.is_none() || unit == "\"a\" ");
+    }
+}
+
+#[test]
 fn depth_takes_no_stack() {
     for unit in ["geometry union ", "union ", "sphere ", "materials entry "] {
         let text = format!("geometry {}", unit.repeat(LONG / 10));
