@@ -16,7 +16,8 @@ use rayon::prelude::*;
 use rtfarm_core::{
     isa::Isa,
     picture::{Picture, PictureFormat},
-    prepared::{PreparedScene, prepare},
+    prepare::prepare,
+    prepared::PreparedScene,
     read::read_scene,
     render::{DEFAULT_CUTOFF, Settings, render_tile},
     tile::{Area, Size},
@@ -53,7 +54,7 @@ fn render(name: &str) -> Vec<u8> {
     let prepared = PreparedScene::open(prepare(&scene).unwrap()).unwrap();
     let viewport = scene.viewport.unwrap();
     let size = small(scene.size_hint.unwrap_or_else(|| viewport.default_size()));
-    let settings = Settings { size, samples: 8, seed: 0, flat: false };
+    let settings = Settings { size, samples: 8, seed: 0, flat: false, cutoff: DEFAULT_CUTOFF };
     let area = Area { x0: 0, y0: 0, width: size.width(), height: size.height() };
 
     let render = |isa| {

@@ -99,6 +99,7 @@ impl Farm {
             hash: hash.into(),
             rays: 64,
             seconds: 0.1,
+            cut: 0.0,
         };
         let answer = self.tiles.deliver(delivery).await;
         answer.map(|answer| answer.into_inner().verdict()).map_err(|status| status.code())

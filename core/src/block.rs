@@ -128,6 +128,15 @@ impl Block {
         }
     }
 
+    /// Whether it holds fields only.
+    fn is_leaf(self) -> bool {
+        !self.is_operation()
+            && !matches!(
+                self,
+                Self::File | Self::Viewport | Self::Materials | Self::Lights | Self::Geometry
+            )
+    }
+
     /// Whether it joins solids.
     pub(crate) fn is_operation(self) -> bool {
         matches!(self, Self::Union | Self::Intersection | Self::Difference)
@@ -228,10 +237,17 @@ impl<'t, T> Field<'t, T> {
         self.value = value;
     }
 
-    /// The value; it is an error when the field was never set.
-    pub(crate) fn require(self, report: &mut Report, block: Word<'t>, field: &str) -> Option<T> {
-        if self.word.is_none() {
-            report.error(block.span(), || format!("this {} has no `{field}`", shown(block.bytes)));
+    /// The value; it is an error when the field was never set, unless the text is cut off.
+    pub(crate) fn require(
+        self,
+        blocks: &mut Blocks<'t>,
+        block: Word<'t>,
+        field: &str,
+    ) -> Option<T> {
+        if self.word.is_none() && !blocks.is_cut {
+            blocks
+                .report
+                .error(block.span(), || format!("this {} has no `{field}`", shown(block.bytes)));
         }
         self.value
     }
@@ -248,6 +264,10 @@ pub(crate) struct Blocks<'t> {
     open_counts: [usize; 18],
     /// The field that was read last in the innermost block and how many numbers it takes.
     last_field: Option<(Word<'t>, usize)>,
+    /// Its value.
+    value_span: Range<usize>,
+    /// Whether the text ended in the middle of a block, so that nobody knows what it lacks.
+    pub(crate) is_cut: bool,
     /// Bytes that may still be looked through for the end of unknown blocks. Without a limit
     /// each of a million unknown words could look through the whole file.
     look_ahead: usize,
@@ -262,6 +282,8 @@ impl<'t> Blocks<'t> {
             open: Vec::new(),
             open_counts: [0; 18],
             last_field: None,
+            value_span: 0..0,
+            is_cut: false,
             look_ahead: text.len().saturating_add(1 << 16),
         }
     }
@@ -292,6 +314,7 @@ impl<'t> Blocks<'t> {
             let block = self.innermost();
             let Some(word) = self.lexer.peek() else {
                 if let Some(&(_, opening)) = self.open.last() {
+                    self.is_cut = true;
                     self.report.error(opening.span(), || {
                         format!(
                             "this {} is never closed: `{}` is missing",
@@ -315,12 +338,14 @@ impl<'t> Blocks<'t> {
                     return None;
                 }
                 self.lexer.go_to(word.end);
+                if block.is_leaf() {
+                    self.report_wrong_end(&word);
+                    self.leave();
+                    return None;
+                }
                 self.report.error(word.span(), || {
-                    format!(
-                        "no {} is open that {} could end",
-                        shown(ended.word().as_bytes()),
-                        shown(word.bytes)
-                    )
+                    let ended = shown(ended.word().as_bytes());
+                    format!("no {ended} is open that {} could end", shown(word.bytes))
                 });
                 continue;
             }
@@ -365,6 +390,17 @@ impl<'t> Blocks<'t> {
         }
     }
 
+    /// A leaf that is ended by another's word: whoever ends something means what is open.
+    fn report_wrong_end(&mut self, word: &Word<'t>) {
+        if let Some(&(block, opening)) = self.open.last() {
+            self.report.error_with(
+                word.span(),
+                || format!("{} cannot end this: `{}` does", shown(word.bytes), block.end()),
+                || Some((opening.span(), "opened here".into())),
+            );
+        }
+    }
+
     fn report_missing_end(&mut self, before: &Word<'t>) {
         if let Some(&(block, opening)) = self.open.last() {
             self.report.error_with(
@@ -397,19 +433,23 @@ impl<'t> Blocks<'t> {
     /// Reports a word that begins with `end` and ends nothing; whether it closed the block.
     fn finish_unknown_end(&mut self, word: &Word<'t>) -> bool {
         let end = self.innermost().end();
-        let guess =
-            suggestion(word.bytes, [end].into_iter().chain(OPENED.iter().map(|block| block.end())));
-        let is_open = self.open.last().is_some();
-        self.report.error(word.span(), || match (&guess, is_open) {
-            (Some(guess), _) => {
-                format!("{} ends no block; did you mean `{guess}`?", shown(word.bytes))
+        let is_open = !self.open.is_empty();
+        let closes = is_open
+            && word.bytes.len().abs_diff(end.len()) <= 3
+            && suggestion(word.bytes, [end]).is_some();
+        self.report.error(word.span(), || {
+            let ends = OPENED.iter().map(|block| block.end());
+            let guess = if closes { Some(end.to_owned()) } else { suggestion(word.bytes, ends) };
+            match (guess, is_open) {
+                (Some(guess), _) => {
+                    format!("{} ends no block; did you mean `{guess}`?", shown(word.bytes))
+                }
+                (None, true) => {
+                    format!("{} ends no block; `{end}` would end this one", shown(word.bytes))
+                }
+                (None, false) => format!("{} ends no block", shown(word.bytes)),
             }
-            (None, true) => {
-                format!("{} ends no block; `{end}` would end this one", shown(word.bytes))
-            }
-            (None, false) => format!("{} ends no block", shown(word.bytes)),
         });
-        let closes = is_open && guess.as_deref() == Some(end);
         if closes {
             self.leave();
         }
@@ -427,33 +467,62 @@ impl<'t> Blocks<'t> {
             self.skip_line();
             return;
         }
-        let candidates = || {
+        let is_block = self.skip_unknown(&word);
+        let hint = || {
             let inner =
                 OPENED.iter().filter(|inner| inner.stands_in(block)).map(|inner| inner.word());
-            block.fields().iter().copied().chain(inner)
+            if let Some(guess) = suggestion(word.bytes, block.fields().iter().copied().chain(inner))
+            {
+                return format!("; did you mean `{guess}`?");
+            }
+            let homes: Vec<_> = OPENED
+                .iter()
+                .filter(|home| home.fields().iter().any(|field| field.as_bytes() == word.bytes))
+                .map(|home| format!("`{}`", home.word()))
+                .take(4)
+                .collect();
+            match (block, &homes[..]) {
+                (Block::Union | Block::Intersection | Block::Difference, _)
+                    if word.bytes == b"material" =>
+                {
+                    "; each of the solids has its own".into()
+                }
+                (_, []) => String::new(),
+                (_, [home]) => format!("; it belongs in {home}"),
+                (_, [others @ .., last]) => {
+                    format!("; it belongs in {} or {last}", others.join(", "))
+                }
+            }
         };
-        let hint =
-            suggestion(word.bytes, candidates()).map(|guess| format!("; did you mean `{guess}`?"));
-        let is_block = self.skip_unknown(&word);
-        let word = (word.span(), shown(word.bytes));
         match (block, is_block) {
-            (Block::File, false) => self.report.error(word.0, || {
-                let hint = hint.unwrap_or_else(|| {
-                    ": a file consists of `viewport`, `materials`, `lights` and `geometry`".into()
+            (Block::File, false) => self.report.error(word.span(), || match hint() {
+                hint if hint.is_empty() => format!(
+                    "{} begins no section: a file consists of `viewport`, `materials`, `lights` and `geometry`",
+                    shown(word.bytes)
+                ),
+                hint => format!("{} begins no section{hint}", shown(word.bytes)),
+            }),
+            (_, true) => self.report.warn(word.span(), || {
+                format!("the block {} is unknown and skipped{}", shown(word.bytes), hint())
+            }),
+            (_, false) => {
+                let last_field =
+                    self.last_field.filter(|(field, _)| self.is_on_one_line(field.end..word.start));
+                self.report.warn(word.span(), || {
+                    let unknown = shown(word.bytes);
+                    match last_field {
+                        Some((field, count)) => {
+                            let values = match count {
+                                0 => "one word".into(),
+                                1 => "one number".into(),
+                                _ => format!("{count} numbers"),
+                            };
+                            format!("{} takes {values}; from {unknown} on the line is skipped", shown(field.bytes))
+                        }
+                        None => format!("{unknown} is not known in `{}`, and its line is skipped{}", block.word(), hint()),
+                    }
                 });
-                format!("{} begins no section{hint}", word.1)
-            }),
-            (_, true) => self.report.warn(word.0, || {
-                format!("the block {} is unknown and skipped{}", word.1, hint.unwrap_or_default())
-            }),
-            (_, false) => self.report.warn(word.0, || {
-                format!(
-                    "`{}` knows no {}; skipped to the end of the line{}",
-                    block.word(),
-                    word.1,
-                    hint.unwrap_or_default()
-                )
-            }),
+            }
         }
     }
 
@@ -482,20 +551,19 @@ impl<'t> Blocks<'t> {
     /// Skips to the end of the line, or to a word on it that opens or ends a block here.
     fn skip_line(&mut self) {
         let block = self.innermost();
-        let line_end = {
-            let mut line = self.lexer.clone();
-            line.skip_line();
-            line.at()
+        let stops = |word: &Word<'t>| {
+            Block::ended_by(word).is_some_and(|ended| self.open_counts[ended as usize] > 0)
+                || Block::opened_by(word).is_some_and(|opened| opened.stands_in(block))
         };
-        while let Some(next) = self.lexer.peek().filter(|next| next.start < line_end) {
-            let stops = Block::ended_by(&next)
-                .is_some_and(|ended| self.open_counts[ended as usize] > 0)
-                || Block::opened_by(&next).is_some_and(|opened| opened.stands_in(block));
-            if stops {
-                return;
-            }
-            self.lexer.go_to(next.end);
+        let mut ahead = self.lexer.clone();
+        let mut end = ahead.at();
+        while let Some(word) = ahead.next()
+            && self.is_on_one_line(end..word.start)
+            && !stops(&word)
+        {
+            end = word.end;
         }
+        self.lexer.go_to(end);
     }
 
     /// Reads the `N` numbers of a field; `None` when that failed and was reported.
@@ -504,6 +572,7 @@ impl<'t> Blocks<'t> {
         let mut numbers = [0.0; N];
         let mut is_sound = true;
         let mut end = field.end;
+        self.value_span = field.span();
         for (count, number) in numbers.iter_mut().enumerate() {
             let Some(word) = self.lexer.peek().filter(|word| self.is_value(word, end)) else {
                 if is_sound {
@@ -513,11 +582,12 @@ impl<'t> Blocks<'t> {
             };
             self.lexer.go_to(word.end);
             end = word.end;
+            self.value_span = if count == 0 { word.start } else { self.value_span.start }..end;
             match word.number() {
                 Some(value) if value.is_finite() => *number = value,
                 _ if is_sound => {
                     is_sound = false;
-                    self.report_bad_number(&word);
+                    self.report_bad_number(&word, N);
                 }
                 _ => {}
             }
@@ -530,9 +600,15 @@ impl<'t> Blocks<'t> {
         self.numbers::<1>(field).map(|[number]| number)
     }
 
-    /// Whether the next word can only be a number.
-    pub(crate) fn is_number_next(&self) -> bool {
-        self.lexer.peek().is_some_and(|word| word.is_number_like())
+    /// How many of the next two words can only be numbers.
+    pub(crate) fn numbers_that_follow(&self) -> usize {
+        let mut ahead = self.lexer.clone();
+        std::iter::from_fn(|| ahead.next()).take(2).take_while(Word::is_number_like).count()
+    }
+
+    /// Where the numbers stand that were read last.
+    pub(crate) fn value_span(&self) -> Range<usize> {
+        self.value_span.clone()
     }
 
     /// Whether a word behind byte `end` is meant as a value: anything on the same line but a
@@ -561,7 +637,8 @@ impl<'t> Blocks<'t> {
         });
     }
 
-    fn report_bad_number(&mut self, word: &Word<'t>) {
+    fn report_bad_number(&mut self, word: &Word<'t>, needed: usize) {
+        let field = self.last_field.map_or(*word, |(field, _)| field);
         self.report.error(word.span(), || {
             let shown = shown(word.bytes);
             if word.is_named_infinity_or_nan() {
@@ -588,7 +665,12 @@ impl<'t> Blocks<'t> {
                     "{shown} is no number: the decimal sign is a point, as in `{right}`"
                 );
             }
-            format!("{shown} is no number")
+            let numbers =
+                if needed == 1 { "one number".into() } else { format!("{needed} numbers") };
+            format!(
+                "{shown} is no number; {} takes {numbers}",
+                crate::diagnostic::shown(field.bytes)
+            )
         });
     }
 
@@ -621,20 +703,23 @@ impl<'t> Blocks<'t> {
         }
     }
 
-    /// Reports the words that follow a file name on its line: it wants quotes.
-    pub(crate) fn check_file_name_end(&mut self, name: Word<'t>) {
-        let Some(next) = self.lexer.peek() else { return };
-        if name.quotes == Quotes::Bare
-            && self.is_on_one_line(name.end..next.start)
-            && !is_keyword(&next)
-            && !next.is_ellipsis()
-        {
+    /// Whether a file name is all that stands on its line; if not, it wants quotes, and that is
+    /// reported.
+    pub(crate) fn ends_file_name(&mut self, name: Word<'t>) -> bool {
+        let is_continued = name.quotes == Quotes::Bare
+            && self.lexer.peek().is_some_and(|next| {
+                self.is_on_one_line(name.end..next.start)
+                    && !is_keyword(&next)
+                    && !next.is_ellipsis()
+            });
+        if is_continued {
             self.skip_line();
             let end = self.lexer.at();
             self.report.error(name.start..end, || {
                 "a file name with spaces stands in double quotes".into()
             });
         }
+        !is_continued
     }
 }
 

@@ -292,9 +292,11 @@ fn draw_snippet(text: &[u8], diagnostic: &Diagnostic, style: Style) -> String {
         Severity::Warning => Level::WARNING,
     };
     let mut group = Group::with_level(level);
+    // What is on the same line is seen anyway.
     let related = diagnostic
         .related
         .as_ref()
+        .filter(|related| related.at.line != diagnostic.at.line)
         .map(|related| (related, Excerpt::new(text, related.at, &related.span)));
     let mut snippets = vec![(primary.line, primary.snippet(AnnotationKind::Primary, None))];
     if let Some((related, excerpt)) = &related {

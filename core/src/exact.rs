@@ -74,8 +74,10 @@ fn turn(a: DVec2, b: DVec2, c: DVec2) -> Ordering {
 /// Why four points are no quadrangle.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) enum QuadrangleFault {
-    /// All on one line, or two in one place.
+    /// All are on one line.
     Degenerate,
+    /// Two are in one place.
+    SamePlace,
     /// Two sides meet where they should not.
     Crossing,
     /// The corners are `deviation` away from their plane, more than the `tolerance`.
@@ -92,9 +94,10 @@ pub(crate) enum QuadrangleFault {
 pub(crate) fn check_quadrangle(corners: [DVec3; 4]) -> Result<Option<f64>, QuadrangleFault> {
     let triples = [[0, 1, 2], [1, 2, 3], [2, 3, 0], [3, 0, 1]].map(|t| t.map(|k| corners[k]));
     let pairs = [(0, 1), (1, 2), (2, 3), (3, 0), (0, 2), (1, 3)];
-    if pairs.iter().any(|&(j, k)| corners[j] == corners[k])
-        || triples.iter().all(|&[a, b, c]| is_collinear(a, b, c))
-    {
+    if pairs.iter().any(|&(j, k)| corners[j] == corners[k]) {
+        return Err(QuadrangleFault::SamePlace);
+    }
+    if triples.iter().all(|&[a, b, c]| is_collinear(a, b, c)) {
         return Err(QuadrangleFault::Degenerate);
     }
 
@@ -155,11 +158,6 @@ fn is_simple(corners: &[DVec3; 4], normal: DVec3, triples: &[[DVec3; 3]; 4]) -> 
     let size = normal.abs();
     let mut axes = [0, 1, 2];
     axes.sort_by(|&j, &k| size[k].total_cmp(&size[j]));
-    let project = |axis: usize, point: DVec3| match axis {
-        0 => DVec2::new(point.y, point.z),
-        1 => DVec2::new(point.z, point.x),
-        _ => DVec2::new(point.x, point.y),
-    };
     let is_flat = |axis: usize| {
         triples.iter().all(|triple| {
             let [a, b, c] = triple.map(|point| project(axis, point));
@@ -175,6 +173,15 @@ fn is_simple(corners: &[DVec3; 4], normal: DVec3, triples: &[[DVec3; 3]; 4]) -> 
     !segments_touch([a, b], [c, d])
         && !segments_touch([b, c], [d, a])
         && ![[a, b, c], [b, c, d], [c, d, a], [d, a, b]].iter().any(|&[a, b, c]| is_spike(a, b, c))
+}
+
+/// A point as the coordinate axis `axis` sees it, counter-clockwise staying so.
+pub(crate) fn project(axis: usize, point: DVec3) -> DVec2 {
+    match axis {
+        0 => DVec2::new(point.y, point.z),
+        1 => DVec2::new(point.z, point.x),
+        _ => DVec2::new(point.x, point.y),
+    }
 }
 
 /// Whether two segments have a point in common.
@@ -226,7 +233,7 @@ fn decode(number: f64) -> (i64, i32) {
 }
 
 /// The exponent that makes `number` · 2^-exponent lie in 0.5..1; 0 for zero.
-fn exponent(number: f64) -> i32 {
+pub(crate) fn exponent(number: f64) -> i32 {
     let (mantissa, exponent) = decode(number);
     if mantissa == 0 {
         0
@@ -236,7 +243,7 @@ fn exponent(number: f64) -> i32 {
 }
 
 /// `number` · 2^power.
-fn scale_by_power(mut number: f64, mut power: i32) -> f64 {
+pub(crate) fn scale_by_power(mut number: f64, mut power: i32) -> f64 {
     const STEP: i32 = 1000;
     let power_of_two = |power: i32| f64::from_bits(((1023 + power) as u64) << 52);
     while power > STEP {
@@ -342,6 +349,32 @@ mod tests {
     }
 
     #[test]
+    fn bounds_never_decide_what_whole_numbers_do_not() {
+        let mut state = 3;
+        let mut random = || {
+            state = crate::hash::mix(state + 1, 0x1234_5678_9abc_def1);
+            (state >> 11) as f64 / 2.0_f64.powi(53) - 0.5
+        };
+        let (mut flat, mut solid) = (0, 0);
+        for round in 0..20_000 {
+            let [a, u, v] = [(); 3].map(|()| DVec3::new(random(), random(), random()));
+            // Almost on the line and in the plane, and sometimes exactly.
+            let size = two_to(-10 * (round % 7));
+            let on_line = a + random() * u * size;
+            let in_plane = a + (random() * u + random() * v) * size;
+            let [p, q, r] = whole([a, a + u, on_line]).0;
+            let exactly = cross(&less(&q, &p), &less(&r, &p)).iter().all(is_zero);
+            assert_eq!(is_collinear(a, a + u, on_line), exactly);
+            let [p, q, r, s] = whole([a, a + u, a + v, in_plane]).0;
+            let exactly = is_zero(&dot(&cross(&less(&q, &p), &less(&r, &p)), &less(&s, &p)));
+            assert_eq!(is_coplanar(a, a + u, a + v, in_plane), exactly);
+            flat += usize::from(exactly);
+            solid += usize::from(!exactly);
+        }
+        assert!(flat > 0 && solid > 0, "{flat} {solid}");
+    }
+
+    #[test]
     fn simple_quadrangles_pass_at_any_scale() {
         for corners in [
             [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 0.0]],
@@ -369,13 +402,16 @@ mod tests {
 
     #[test]
     fn flat_quadrangles_are_degenerate() {
+        let on_a_line = [[0.0, 0.0, 0.0], [1.0, 1.0, 1.0], [2.0, 2.0, 2.0], [3.0, 3.0, 3.0]];
+        check_quadrangle_at_all_scales(on_a_line, |result| {
+            *result == Err(QuadrangleFault::Degenerate)
+        });
         for corners in [
-            [[0.0, 0.0, 0.0], [1.0, 1.0, 1.0], [2.0, 2.0, 2.0], [3.0, 3.0, 3.0]],
             [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]],
             [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 1.0, 0.0]],
         ] {
             check_quadrangle_at_all_scales(corners, |result| {
-                *result == Err(QuadrangleFault::Degenerate)
+                *result == Err(QuadrangleFault::SamePlace)
             });
         }
     }

@@ -3,6 +3,8 @@
 
 use std::ops::Range;
 
+use crate::number::parse_number;
+
 /// Walks over the words of a scene text.
 #[derive(Debug, Clone)]
 pub(crate) struct Lexer<'t> {
@@ -77,13 +79,6 @@ fn unsigned(word: &[u8]) -> &[u8] {
 
 fn is_infinity_or_nan(unsigned: &[u8]) -> bool {
     ["nan", "inf", "infinity"].iter().any(|name| unsigned.eq_ignore_ascii_case(name.as_bytes()))
-}
-
-/// The decimal number that `word` spells, rounded correctly; -0 becomes 0. Numbers beyond f64 are
-/// infinite.
-pub(crate) fn parse_number(word: &[u8]) -> Option<f64> {
-    let number: f64 = fast_float2::parse(word).ok()?;
-    Some(number + 0.0)
 }
 
 /// What a byte does to the words around it.
@@ -187,11 +182,11 @@ impl<'t> Lexer<'t> {
 
     fn quoted_word(&mut self, start: usize) -> Word<'t> {
         let rest = &self.text[start + 1..];
-        let line = &rest[..memchr::memchr(b'\n', rest).unwrap_or(rest.len())];
-        let (bytes, end, quotes) = if let Some(length) = memchr::memchr(b'"', line) {
-            (&line[..length], start + length + 2, Quotes::Closed)
+        let length = memchr::memchr2(b'"', b'\n', rest).unwrap_or(rest.len());
+        let (bytes, end, quotes) = if rest.get(length) == Some(&b'"') {
+            (&rest[..length], start + length + 2, Quotes::Closed)
         } else {
-            let line = line.strip_suffix(b"\r").unwrap_or(line);
+            let line = rest[..length].strip_suffix(b"\r").unwrap_or(&rest[..length]);
             (line, start + 1 + line.len(), Quotes::Open)
         };
         self.at = end;

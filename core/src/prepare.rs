@@ -195,7 +195,9 @@ struct Ranks {
 impl Ranks {
     fn new(scene: &Scene) -> Self {
         let counts = (scene.parallelepipeds.iter().map(|solid| (solid.primitive, 6)))
-            .chain(scene.meshes.iter().map(|mesh| (mesh.primitive, mesh.triangles.len() as u64)))
+            .chain(
+                scene.meshes.iter().map(|mesh| (mesh.primitive, mesh.shape.triangles.len() as u64)),
+            )
             .chain(scene.solids.iter().map(|solid| {
                 let is_leaf = |node: &&SolidNode| !matches!(node, SolidNode::Operation { .. });
                 (solid.primitive, 6 * solid.nodes.iter().filter(is_leaf).count() as u64)
@@ -286,7 +288,7 @@ impl Faces {
         for mesh in &scene.meshes {
             let vertices = place_mesh(mesh);
             let first = ranks.first(mesh.primitive);
-            for (face, triangle) in (0..).zip(&mesh.triangles) {
+            for (face, triangle) in (0..).zip(&mesh.shape.triangles) {
                 corners.extend(triangle.map(|corner| vertices[corner as usize]));
                 wear.push((mesh.material, first + face));
             }
@@ -789,7 +791,7 @@ fn place_mesh(mesh: &Mesh) -> Vec<DVec3> {
         }
         point + mesh.offset
     };
-    match &mesh.vertices {
+    match &mesh.shape.vertices {
         MeshVertices::Single(vertices) => {
             vertices.iter().map(|v| place(DVec3::from_array(v.map(f64::from)))).collect()
         }

@@ -5,21 +5,20 @@
 //! materials are resolved at the end, since they may be used before they are defined; so are
 //! byte offsets into lines and columns.
 
-use std::{collections::HashMap, io};
+use std::{collections::HashMap, io, sync::Arc};
 
-use glam::{DVec2, DVec3};
+use glam::DVec3;
 
 pub use crate::diagnostic::{Diagnostic, Omitted, Related, Severity, Style, draw_diagnostics};
 use crate::{
     block::{Block, Blocks, Field, suggestion},
     diagnostic::{Places, Report, shown},
-    exact::{self, QuadrangleFault},
+    exact,
     lexer::Word,
-    mesh_file, scene,
-    scene::{
-        Light, Material, MaterialPlaces, Mesh, Operation, Parallelepiped, Quadrangle, Scene, Solid,
-        SolidNode, Sphere, Triangle, Viewport,
-    },
+    mesh_file::{self, MeshFile},
+    scene,
+    scene::{Light, Material, MaterialPlaces, MeshShape, Scene, SolidNode, Viewport},
+    shapes::direction,
     symbol::Symbols,
     texture,
     tile::Size,
@@ -62,7 +61,10 @@ impl Reading {
 /// let nothing = |_: &str| Err(std::io::ErrorKind::NotFound.into());
 /// let reading = read_scene(b"geometry\n  sphere coords 0 0 0 radius -1 endsphere\nendgeometry", &nothing);
 /// let told: Vec<_> = reading.diagnostics.iter().map(|d| format!("{}: {}", d.at, d.message)).collect();
-/// assert_eq!(told, ["2:3: this `sphere` has no `material`", "2:23: the radius is above 0, not -1"]);
+/// assert_eq!(
+///     told,
+///     ["2:3: this `sphere` has no `material`", "2:30: `radius` must be above 0, but is -1"]
+/// );
 /// ```
 pub fn read_scene(text: &[u8], resolve: &Resolve<'_>) -> Reading {
     read_scene_in_pieces(text, resolve, triangles::PIECE)
@@ -82,15 +84,17 @@ pub(crate) fn read_scene_in_pieces(text: &[u8], resolve: &Resolve<'_>, piece: us
 }
 
 /// What has been read so far.
-struct Reader<'t> {
-    text: &'t [u8],
-    piece: usize,
-    blocks: Blocks<'t>,
-    symbols: Symbols<'t>,
-    triangles: Triangles,
-    scene: Scene,
+pub(crate) struct Reader<'t> {
+    pub(crate) text: &'t [u8],
+    /// Whether it is worth reading.
+    is_text: bool,
+    pub(crate) piece: usize,
+    pub(crate) blocks: Blocks<'t>,
+    pub(crate) symbols: Symbols<'t>,
+    pub(crate) triangles: Triangles,
+    pub(crate) scene: Scene,
     /// The next primitive's number.
-    primitive: u64,
+    pub(crate) primitive: u64,
     viewport: Option<Word<'t>>,
     width: Field<'t, u32>,
     height: Field<'t, u32>,
@@ -103,8 +107,8 @@ struct Reader<'t> {
     material_offsets: Vec<[Option<usize>; 4]>,
     /// The file name of each material's texture.
     texture_names: Vec<(u32, Word<'t>)>,
-    solid_offsets: Vec<usize>,
-    mesh_words: Vec<MeshWords<'t>>,
+    pub(crate) solid_offsets: Vec<usize>,
+    pub(crate) mesh_words: Vec<MeshWords<'t>>,
 }
 
 /// A point light before the reference that governs it is known.
@@ -118,24 +122,18 @@ struct PointLight<'t> {
 }
 
 /// Where a mesh begins and what its file is called.
-struct MeshWords<'t> {
-    opening: Word<'t>,
-    file: Word<'t>,
-}
-
-/// A set operation whose end has not come yet.
-struct OpenOperation<'t> {
-    opening: Word<'t>,
-    operation: Operation,
-    operands: u32,
+pub(crate) struct MeshWords<'t> {
+    pub(crate) opening: Word<'t>,
+    pub(crate) file: Word<'t>,
 }
 
 impl<'t> Reader<'t> {
     fn new(text: &'t [u8], piece: usize, textured: &[Vec<u8>]) -> Self {
         let mut report = Report::default();
-        check_encoding(text, &mut report);
+        let is_text = check_encoding(text, &mut report);
         Self {
             text,
+            is_text,
             piece,
             blocks: Blocks::new(text, report),
             symbols: Symbols::new(textured),
@@ -156,15 +154,14 @@ impl<'t> Reader<'t> {
         }
     }
 
-    fn report(&mut self) -> &mut Report {
+    pub(crate) fn report(&mut self) -> &mut Report {
         &mut self.blocks.report
     }
 
     fn read_file(&mut self) {
-        if is_other_format(self.text) {
-            return;
-        }
-        while let Some(word) = self.blocks.next() {
+        while self.is_text
+            && let Some(word) = self.blocks.next()
+        {
             match Block::opened_by(&word) {
                 Some(block @ Block::Viewport) => self.read_viewport(word, block),
                 Some(Block::Materials) => self.read_materials(word),
@@ -212,16 +209,17 @@ impl<'t> Reader<'t> {
             let value = self.blocks.numbers(word).map(DVec3::from);
             corner.set(&mut self.blocks.report, word, value);
         }
-        let report = &mut self.blocks.report;
-        let origin = origin.require(report, opening, "origin");
+        let (eye_word, corner_word) =
+            (origin.word.unwrap_or(opening), top_left.word.unwrap_or(opening));
+        let origin = origin.require(&mut self.blocks, opening, "origin");
         let corners = [(top_left, "topleft"), (bottom_left, "bottomleft"), (top_right, "topright")]
-            .map(|(corner, name)| corner.require(report, opening, name));
+            .map(|(corner, name)| corner.require(&mut self.blocks, opening, name));
         if self.viewport.is_none()
             && let (Some(eye), [Some(top_left), Some(bottom_left), Some(top_right)]) =
                 (origin, corners)
         {
             let viewport = Viewport { eye, top_left, bottom_left, top_right };
-            check_viewport(&viewport, opening, report);
+            check_viewport(&viewport, eye_word, corner_word, &mut self.blocks.report);
             self.scene.viewport = Some(viewport);
         }
         self.viewport.get_or_insert(opening);
@@ -245,7 +243,7 @@ impl<'t> Reader<'t> {
             }
             b"xres" | b"yres" => {
                 self.warn_synonym(word, "`size` in `viewport`");
-                let side = self.blocks.number(word).and_then(|side| self.side(word, side));
+                let side = self.blocks.number(word).and_then(|side| self.side(side));
                 let field = if word.bytes == b"xres" { &mut self.width } else { &mut self.height };
                 field.set(&mut self.blocks.report, word, side);
             }
@@ -258,17 +256,17 @@ impl<'t> Reader<'t> {
         let sides = self
             .blocks
             .numbers(word)
-            .and_then(|[width, height]| Some((self.side(word, width)?, self.side(word, height)?)));
+            .and_then(|[width, height]| Some((self.side(width)?, self.side(height)?)));
         self.width.set(&mut self.blocks.report, word, sides.map(|(width, _)| width));
         self.height.word = Some(word);
         self.height.value = sides.map(|(_, height)| height);
     }
 
     /// A side of the picture in pixels.
-    fn side(&mut self, word: Word<'t>, side: f64) -> Option<u32> {
+    fn side(&mut self, side: f64) -> Option<u32> {
         let is_sound = side.fract() == 0.0 && (1.0..=f64::from(Size::MAX_SIDE)).contains(&side);
         if !is_sound {
-            self.report().error(word.span(), || {
+            self.refuse_value(|| {
                 format!(
                     "a picture's sides are whole numbers from 1 to {}, not {side}",
                     Size::MAX_SIDE
@@ -278,19 +276,28 @@ impl<'t> Reader<'t> {
         is_sound.then_some(side as u32)
     }
 
-    /// A colour where 255 is 1, that may be brighter but not negative.
-    fn color(&mut self, word: Word<'t>) -> Option<DVec3> {
-        let color = self.blocks.numbers::<3>(word)?;
-        if let Some(negative) = color.into_iter().find(|&part| part < 0.0) {
-            self.report().error(word.span(), || {
-                format!("the parts of {} are not below 0, as {negative} is", shown(word.bytes))
-            });
-            return None;
-        }
-        Some(DVec3::from(color) / 255.0)
+    /// Reports that the value that was read last cannot be used.
+    pub(crate) fn refuse_value(&mut self, message: impl FnOnce() -> String) {
+        let span = self.blocks.value_span();
+        self.report().error(span, message);
     }
 
-    fn warn_synonym(&mut self, word: Word<'t>, instead: &str) {
+    /// A colour where 255 is 1, that may be brighter but not negative.
+    fn color(&mut self, word: Word<'t>) -> Option<DVec3> {
+        let color = DVec3::from(self.blocks.numbers(word)?);
+        let is_color = color.min_element() >= 0.0;
+        if !is_color {
+            self.refuse_value(|| {
+                format!(
+                    "the parts of a colour must be 0 or more, but one is {}",
+                    color.min_element()
+                )
+            });
+        }
+        is_color.then_some(color / 255.0)
+    }
+
+    pub(crate) fn warn_synonym(&mut self, word: Word<'t>, instead: &str) {
         self.report().warn(word.span(), || format!("{} is read as {instead}", shown(word.bytes)));
     }
 
@@ -316,16 +323,15 @@ impl<'t> Reader<'t> {
                     name.set(&mut self.blocks.report, word, value);
                 }
                 b"color" => {
-                    let value =
-                        self.blocks.numbers(word).map(|parts| self.clamp_color(word, parts));
+                    let value = self.blocks.numbers(word).map(|parts| self.clamp_color(parts));
                     color.set(&mut self.blocks.report, word, value);
                 }
                 b"alpha" => {
-                    let value = self.blocks.number(word).map(|value| self.clamp_alpha(word, value));
+                    let value = self.blocks.number(word).map(|value| self.clamp_alpha(value));
                     alpha.set(&mut self.blocks.report, word, value);
                 }
                 b"reflect" => {
-                    let value = self.blocks.number(word).and_then(|value| self.share(word, value));
+                    let value = self.blocks.number(word).and_then(|value| self.share(value));
                     reflect.set(&mut self.blocks.report, word, value);
                 }
                 b"refract" => {
@@ -343,7 +349,7 @@ impl<'t> Reader<'t> {
                 _ => self.blocks.skip_unknown_keyword(word),
             }
         }
-        let name = name.require(&mut self.blocks.report, opening, "name");
+        let name = name.require(&mut self.blocks, opening, "name");
         let Some(name) = name else { return };
         let index = self.scene.materials.len() as u32;
         let symbol = self.symbols.symbol(name.bytes);
@@ -358,7 +364,7 @@ impl<'t> Reader<'t> {
         if !is_identifier(name.bytes) {
             self.report().warn(name.span(), || {
                 format!(
-                    "{} is no name: letters, digits and `_`, no digit first; taken as it is",
+                    "{} is no C++ identifier (letters, digits and `_`, no digit first); taken as it is",
                     shown(name.bytes)
                 )
             });
@@ -383,10 +389,11 @@ impl<'t> Reader<'t> {
         );
     }
 
-    fn clamp_color(&mut self, word: Word<'t>, parts: [f64; 3]) -> DVec3 {
+    fn clamp_color(&mut self, parts: [f64; 3]) -> DVec3 {
         let clamped = parts.map(|part| part.clamp(0.0, 255.0));
         if parts.iter().any(|part| !(0.0..=255.0).contains(part)) {
-            self.report().warn(word.span(), || {
+            let span = self.blocks.value_span();
+            self.report().warn(span, || {
                 let [r, g, b] = clamped;
                 format!("the parts of a colour are from 0 to 255; taken as {r} {g} {b}")
             });
@@ -394,10 +401,11 @@ impl<'t> Reader<'t> {
         DVec3::from(clamped) / 255.0
     }
 
-    fn clamp_alpha(&mut self, word: Word<'t>, alpha: f64) -> f64 {
+    fn clamp_alpha(&mut self, alpha: f64) -> f64 {
         let clamped = alpha.clamp(0.0, 1.0);
         if !(0.0..=1.0).contains(&alpha) {
-            self.report().warn(word.span(), || {
+            let span = self.blocks.value_span();
+            self.report().warn(span, || {
                 format!("alpha is from 0, clear, to 1, opaque; {alpha} is taken as {clamped}")
             });
         }
@@ -405,19 +413,18 @@ impl<'t> Reader<'t> {
     }
 
     /// The mirrored share, or a percentage of it.
-    fn share(&mut self, word: Word<'t>, reflect: f64) -> Option<f64> {
+    fn share(&mut self, reflect: f64) -> Option<f64> {
         match reflect {
             0.0..=1.0 => Some(reflect),
             1.0..=100.0 => {
-                let share = reflect / 100.0;
-                self.report().warn(word.span(), || {
+                let (share, span) = (reflect / 100.0, self.blocks.value_span());
+                self.report().warn(span, || {
                     format!("reflect is from 0 to 1; {reflect} is read as percent, {share}")
                 });
                 Some(share)
             }
             _ => {
-                self.report()
-                    .error(word.span(), || format!("reflect is from 0 to 1, not {reflect}"));
+                self.refuse_value(|| format!("reflect must be from 0 to 1, but is {reflect}"));
                 None
             }
         }
@@ -425,24 +432,23 @@ impl<'t> Reader<'t> {
 
     fn not_negative(&mut self, word: Word<'t>, value: f64) -> Option<f64> {
         if value < 0.0 {
-            self.report()
-                .error(word.span(), || format!("{} is not below 0, as {value} is", plain(word)));
+            self.refuse_value(|| {
+                format!("{} must be 0 or more, but is {value}", shown(word.bytes))
+            });
         }
         (value >= 0.0).then_some(value)
     }
 
-    fn above_zero(&mut self, word: Word<'t>, value: f64) -> Option<f64> {
+    pub(crate) fn above_zero(&mut self, word: Word<'t>, value: f64) -> Option<f64> {
         if value <= 0.0 {
-            self.report()
-                .error(word.span(), || format!("the {} is above 0, not {value}", plain(word)));
+            self.refuse_value(|| format!("{} must be above 0, but is {value}", shown(word.bytes)));
         }
         (value > 0.0).then_some(value)
     }
 
-    fn file_name(&mut self, word: Word<'t>) -> Option<Word<'t>> {
+    pub(crate) fn file_name(&mut self, word: Word<'t>) -> Option<Word<'t>> {
         let name = self.blocks.value_word(word, "a file name")?;
-        self.blocks.check_file_name_end(name);
-        Some(name)
+        self.blocks.ends_file_name(name).then_some(name)
     }
 
     fn read_lights(&mut self, opening: Word<'t>) {
@@ -452,14 +458,7 @@ impl<'t> Reader<'t> {
                 b"reference" => self.read_reference(word),
                 b"point" => self.read_point(word),
                 b"ambient" => {
-                    let first = self.blocks.number(word);
-                    let light = match first {
-                        Some(first) if self.blocks.is_number_next() => {
-                            self.blocks.numbers(word).map(|[g, b]| DVec3::new(first, g, b) / 255.0)
-                        }
-                        first => first.map(DVec3::splat),
-                    };
-                    let light = light.filter(|light| self.is_light(word, *light));
+                    let light = self.read_ambient(word);
                     self.ambient.set(&mut self.blocks.report, word, light);
                 }
                 b"backlight" => {
@@ -472,12 +471,25 @@ impl<'t> Reader<'t> {
         }
     }
 
-    fn is_light(&mut self, word: Word<'t>, light: DVec3) -> bool {
-        let is_light = light.min_element() >= 0.0;
-        if !is_light {
-            self.report().error(word.span(), || format!("{} is not below 0", plain(word)));
+    /// Reads one number, or the three of a colour.
+    fn read_ambient(&mut self, word: Word<'t>) -> Option<DVec3> {
+        let first = self.blocks.number(word)?;
+        let light = match self.blocks.numbers_that_follow() {
+            0 => DVec3::splat(first),
+            1 => {
+                self.refuse_value(|| {
+                    "`ambient` takes one number or three, but two stand here".into()
+                });
+                self.blocks.number(word);
+                return None;
+            }
+            _ => self.blocks.numbers(word).map(|[g, b]| DVec3::new(first, g, b) / 255.0)?,
+        };
+        if light.min_element() < 0.0 {
+            self.refuse_value(|| "ambient light must be 0 or more".into());
+            return None;
         }
-        is_light
+        Some(light)
     }
 
     fn read_reference(&mut self, opening: Word<'t>) {
@@ -524,9 +536,8 @@ impl<'t> Reader<'t> {
                 _ => self.blocks.skip_unknown_keyword(word),
             }
         }
-        let report = &mut self.blocks.report;
-        let position = coords.require(report, opening, "coords");
-        let power = power.require(report, opening, "power");
+        let position = coords.require(&mut self.blocks, opening, "coords");
+        let power = power.require(&mut self.blocks, opening, "power");
         if let (Some(position), Some(power)) = (position, power) {
             self.lights.push(PointLight {
                 word: opening,
@@ -538,396 +549,12 @@ impl<'t> Reader<'t> {
         }
     }
 
-    fn read_coords(&mut self, word: Word<'t>, coords: &mut Field<'t, DVec3>) {
+    pub(crate) fn read_coords(&mut self, word: Word<'t>, coords: &mut Field<'t, DVec3>) {
         if word.bytes == b"position" {
             self.warn_synonym(word, "`coords`");
         }
         let value = self.blocks.numbers(word).map(DVec3::from);
         coords.set(&mut self.blocks.report, word, value);
-    }
-
-    /// Reads the shapes. Operations may be nested a million deep: those that are open form a
-    /// list, not calls.
-    fn read_geometry(&mut self, opening: Word<'t>) {
-        self.blocks.enter(Block::Geometry, opening);
-        let mut operations: Vec<OpenOperation<'t>> = Vec::new();
-        let mut nodes: Vec<SolidNode> = Vec::new();
-        let mut leaf_count = 0;
-        loop {
-            let Some(word) = self.blocks.next() else {
-                let Some(done) = operations.pop() else { return };
-                self.finish_operation(&done, &mut nodes);
-                if let Some(outer) = operations.last_mut() {
-                    outer.operands += 1;
-                } else {
-                    self.finish_solid(done.opening, std::mem::take(&mut nodes));
-                    leaf_count = 0;
-                }
-                continue;
-            };
-            let Some(block) = Block::opened_by(&word) else {
-                self.blocks.skip_unknown_keyword(word);
-                continue;
-            };
-            if let Some(operation) = operation(block) {
-                self.blocks.enter(block, word);
-                operations.push(OpenOperation { opening: word, operation, operands: 0 });
-                continue;
-            }
-            let is_solid = matches!(block, Block::Sphere | Block::Parallelepiped);
-            if let Some(outer) = operations.last_mut() {
-                if is_solid {
-                    outer.operands += 1;
-                    leaf_count += 1;
-                } else {
-                    let outer = outer.opening;
-                    self.report().error(word.span(), || {
-                        format!(
-                            "{} takes solids: spheres, parallelepipeds and operations on them, no {}",
-                            shown(outer.bytes),
-                            plain(word)
-                        )
-                    });
-                }
-            }
-            let is_alone = operations.is_empty();
-            match block {
-                Block::Sphere => {
-                    let primitive =
-                        if is_alone { self.next_primitive(word) } else { leaf_count - 1 };
-                    if let Some(sphere) = self.read_sphere(word, primitive) {
-                        if is_alone {
-                            self.scene.spheres.push(sphere);
-                        } else {
-                            nodes.push(SolidNode::Sphere(sphere));
-                        }
-                    }
-                }
-                Block::Parallelepiped => {
-                    let primitive =
-                        if is_alone { self.next_primitive(word) } else { leaf_count - 1 };
-                    if let Some(parallelepiped) = self.read_parallelepiped(word, primitive) {
-                        if is_alone {
-                            self.scene.parallelepipeds.push(parallelepiped);
-                        } else {
-                            nodes.push(SolidNode::Parallelepiped(parallelepiped));
-                        }
-                    }
-                }
-                Block::Triangle => {
-                    if is_alone && self.read_plain_triangles(word) {
-                        continue;
-                    }
-                    self.read_triangle(word);
-                }
-                Block::Quadrangle => self.read_quadrangle(word),
-                _ => self.read_mesh(word, block),
-            }
-        }
-    }
-}
-
-impl<'t> Reader<'t> {
-    fn finish_operation(&mut self, done: &OpenOperation<'t>, nodes: &mut Vec<SolidNode>) {
-        let OpenOperation { opening, operation, operands } = *done;
-        if operands < 2 {
-            let found = if operands == 0 { "none" } else { "only one" };
-            self.report().error(opening.span(), || {
-                format!(
-                    "{} joins two or more solids, but {found} stands here",
-                    shown(opening.bytes)
-                )
-            });
-        }
-        nodes.push(SolidNode::Operation { operation, operands });
-    }
-
-    fn finish_solid(&mut self, opening: Word<'t>, nodes: Vec<SolidNode>) {
-        let primitive = self.next_primitive(opening);
-        self.solid_offsets.push(opening.start);
-        self.scene.solids.push(Solid { nodes, primitive, at: NOWHERE });
-    }
-
-    /// The number of a primitive that begins at `word`.
-    fn next_primitive(&mut self, word: Word<'t>) -> u32 {
-        let number = u32::try_from(self.primitive);
-        if self.primitive == u64::from(u32::MAX) {
-            self.report()
-                .error(word.span(), || format!("a scene has at most {} primitives", u32::MAX));
-        }
-        self.primitive += 1;
-        number.unwrap_or(u32::MAX)
-    }
-
-    /// Reads as many plain triangle blocks as there are, from the one that `word` opens; whether
-    /// there was one.
-    fn read_plain_triangles(&mut self, word: Word<'t>) -> bool {
-        let at = self.triangles.read_run(
-            self.text,
-            word.start,
-            self.piece,
-            &mut self.primitive,
-            &mut self.symbols,
-        );
-        if at > word.start {
-            self.blocks.lexer.go_to(at);
-        }
-        at > word.start
-    }
-
-    fn material(&mut self, word: Word<'t>, shape: &'static str) -> Option<u32> {
-        let name = self.blocks.value_word(word, "the name of a material")?;
-        Some(match shape {
-            "triangle" | "quadrangle" => self.symbols.use_on_flat(name, 1),
-            _ => self.symbols.use_on_untexturable(name, shape),
-        })
-    }
-
-    fn read_sphere(&mut self, opening: Word<'t>, primitive: u32) -> Option<Sphere> {
-        self.blocks.enter(Block::Sphere, opening);
-        let (mut coords, mut radius, mut material) =
-            (Field::default(), Field::default(), Field::default());
-        while let Some(word) = self.blocks.next() {
-            match word.bytes {
-                b"coords" | b"position" => self.read_coords(word, &mut coords),
-                b"radius" => {
-                    let value =
-                        self.blocks.number(word).and_then(|value| self.above_zero(word, value));
-                    radius.set(&mut self.blocks.report, word, value);
-                }
-                b"material" => {
-                    let value = self.material(word, "sphere");
-                    material.set(&mut self.blocks.report, word, value);
-                }
-                _ => self.blocks.skip_unknown_keyword(word),
-            }
-        }
-        let report = &mut self.blocks.report;
-        let center = coords.require(report, opening, "coords");
-        let radius = radius.require(report, opening, "radius");
-        let material = material.require(report, opening, "material");
-        Some(Sphere { center: center?, radius: radius?, material: material?, primitive })
-    }
-
-    fn read_triangle(&mut self, opening: Word<'t>) {
-        let primitive = self.next_primitive(opening);
-        let Some((vertices, texcoords, material)) =
-            self.read_corners(Block::Triangle, opening, "triangle")
-        else {
-            return;
-        };
-        self.triangles.add(
-            Triangle { vertices, material, primitive },
-            texcoords,
-            &mut self.symbols,
-        );
-    }
-
-    fn read_quadrangle(&mut self, opening: Word<'t>) {
-        let primitive = self.next_primitive(opening);
-        let Some((vertices, texcoords, material)) =
-            self.read_corners(Block::Quadrangle, opening, "quadrangle")
-        else {
-            return;
-        };
-        match exact::check_quadrangle(vertices) {
-            Ok(None) => {}
-            Ok(Some(deviation)) => self.report().warn(opening.span(), || {
-                format!("this quadrangle is planar only to within {deviation:.3e}; taken as planar")
-            }),
-            Err(fault) => {
-                self.report().error(opening.span(), || match fault {
-                    QuadrangleFault::Degenerate => {
-                        "this quadrangle has no area, or two vertices in one place".into()
-                    }
-                    QuadrangleFault::Crossing => {
-                        "the sides of this quadrangle cross or touch; its vertices go around once".into()
-                    }
-                    QuadrangleFault::NotPlanar { deviation, tolerance } => format!(
-                        "this quadrangle is not planar: its vertices are {deviation:.3e} off its plane, and \
-                         {tolerance:.3e} is the most; two triangles may be bent"
-                    ),
-                });
-                return;
-            }
-        }
-        let index = self.scene.quadrangles.len() as u32;
-        self.scene.quadrangles.push(Quadrangle { vertices, material, primitive });
-        self.scene.quadrangle_texcoords.extend(texcoords.map(|texcoords| (index, texcoords)));
-    }
-
-    fn read_parallelepiped(&mut self, opening: Word<'t>, primitive: u32) -> Option<Parallelepiped> {
-        let (vertices, _, material) =
-            self.read_corners::<4>(Block::Parallelepiped, opening, "parallelepiped")?;
-        let corner = vertices[0];
-        let edges = [1, 2, 3].map(|k| vertices[k] - corner);
-        if exact::is_coplanar(vertices[0], vertices[1], vertices[2], vertices[3]) {
-            self.report().error(opening.span(), || {
-                "this parallelepiped has no volume: its vertices are a corner and that corner's three \
-                 neighbours, not all in one plane"
-                    .into()
-            });
-            return None;
-        }
-        if !edges.iter().all(|edge| edge.is_finite()) {
-            self.report().error(opening.span(), || {
-                "this parallelepiped is too large to be computed with".into()
-            });
-            return None;
-        }
-        let condition = condition(edges);
-        if condition.is_nan() || condition > MOST_SHEARED {
-            self.report().error(opening.span(), || {
-                format!(
-                    "this parallelepiped is too flat to be computed with: its condition number is {condition:.1e}, \
-                     and {MOST_SHEARED:.0e} is the most"
-                )
-            });
-            return None;
-        }
-        Some(Parallelepiped { corner, edges, material, primitive })
-    }
-
-    /// Reads a block of `N` vertices, each perhaps with texture coordinates, and a material.
-    fn read_corners<const N: usize>(
-        &mut self,
-        block: Block,
-        opening: Word<'t>,
-        shape: &'static str,
-    ) -> Option<([DVec3; N], Option<[DVec2; N]>, u32)> {
-        self.blocks.enter(block, opening);
-        let mut vertices = [DVec3::ZERO; N];
-        let mut texcoords = [Field::<DVec2>::default(); N];
-        let (mut count, mut is_sound) = (0, true);
-        let mut material = Field::default();
-        while let Some(word) = self.blocks.next() {
-            match word.bytes {
-                b"vertex" => {
-                    let vertex = self.blocks.numbers(word).map(DVec3::from);
-                    match vertices.get_mut(count) {
-                        Some(place) => *place = vertex.unwrap_or_default(),
-                        None if count == N => self.report().error(word.span(), || {
-                            format!("a {shape} has {N} vertices; this is one more")
-                        }),
-                        None => {}
-                    }
-                    is_sound &= vertex.is_some() && count < N;
-                    count += 1;
-                }
-                b"texcoord" | b"textureCoord" if N != 4 || block == Block::Quadrangle => {
-                    if word.bytes == b"textureCoord" {
-                        self.warn_synonym(word, "`texcoord`");
-                    }
-                    let value = self.blocks.numbers(word).map(DVec2::from);
-                    if word.bytes == b"textureCoord" && self.blocks.is_number_next() {
-                        self.blocks.number(word); // The third of three coordinates.
-                    }
-                    is_sound &= value.is_some();
-                    match count.checked_sub(1) {
-                        Some(index) if index < N => {
-                            texcoords[index].set(&mut self.blocks.report, word, value);
-                        }
-                        Some(_) => {}
-                        None => {
-                            is_sound = false;
-                            self.report().error(word.span(), || {
-                                format!(
-                                    "{} stands behind the vertex that it belongs to",
-                                    shown(word.bytes)
-                                )
-                            });
-                        }
-                    }
-                }
-                b"material" => {
-                    let value = self.material(word, shape);
-                    material.set(&mut self.blocks.report, word, value);
-                }
-                _ => self.blocks.skip_unknown_keyword(word),
-            }
-        }
-        if count < N {
-            self.report().error(opening.span(), || {
-                format!("a {shape} has {N} vertices, but this one has {count}")
-            });
-            is_sound = false;
-        }
-        let with_texcoords = texcoords.iter().filter(|texcoord| texcoord.word.is_some()).count();
-        if count >= N && with_texcoords > 0 && with_texcoords < N {
-            is_sound = false;
-            self.report().error(opening.span(), || {
-                format!(
-                    "every vertex has a `texcoord` or none has; here {with_texcoords} of {N} have"
-                )
-            });
-        }
-        let material = material.require(&mut self.blocks.report, opening, "material")?;
-        let texcoords = (with_texcoords == N)
-            .then(|| texcoords.map(|texcoord| texcoord.value.unwrap_or_default()));
-        is_sound.then_some((vertices, texcoords, material))
-    }
-
-    fn read_mesh(&mut self, opening: Word<'t>, block: Block) {
-        if block == Block::StlModel {
-            self.warn_synonym(opening, "`mesh`");
-        }
-        let primitive = self.next_primitive(opening);
-        self.blocks.enter(block, opening);
-        let (mut file, mut material) = (Field::default(), Field::default());
-        let (mut scale, mut rotate, mut offset) =
-            (Field::default(), Field::default(), Field::default());
-        while let Some(word) = self.blocks.next() {
-            match word.bytes {
-                b"file" | b"filename" => {
-                    if word.bytes == b"filename" {
-                        self.warn_synonym(word, "`file`");
-                    }
-                    let value = self.file_name(word);
-                    file.set(&mut self.blocks.report, word, value);
-                }
-                b"material" => {
-                    let value = self.material(word, "mesh");
-                    material.set(&mut self.blocks.report, word, value);
-                }
-                b"scale" => {
-                    let value =
-                        self.blocks.number(word).and_then(|value| self.above_zero(word, value));
-                    scale.set(&mut self.blocks.report, word, value);
-                }
-                b"rotate" => {
-                    let value = self.blocks.numbers(word).and_then(|[x, y, z, degrees]| {
-                        let axis = DVec3::new(x, y, z);
-                        if axis == DVec3::ZERO {
-                            self.report()
-                                .error(word.span(), || "the axis of `rotate` is not 0 0 0".into());
-                        }
-                        (axis != DVec3::ZERO).then_some((axis, degrees))
-                    });
-                    rotate.set(&mut self.blocks.report, word, value);
-                }
-                b"move" => {
-                    let value = self.blocks.numbers(word).map(DVec3::from);
-                    offset.set(&mut self.blocks.report, word, value);
-                }
-                _ => self.blocks.skip_unknown_keyword(word),
-            }
-        }
-        let file = file.require(&mut self.blocks.report, opening, "file");
-        let material = material.require(&mut self.blocks.report, opening, "material");
-        if let (Some(file), Some(material)) = (file, material) {
-            self.mesh_words.push(MeshWords { opening, file });
-            self.scene.meshes.push(Mesh {
-                path: String::from_utf8_lossy(file.bytes).into_owned(),
-                vertices: scene::MeshVertices::Single(Vec::new()),
-                triangles: Vec::new(),
-                scale: scale.value.unwrap_or(1.0),
-                rotate: rotate.value,
-                offset: offset.value.unwrap_or_default(),
-                material,
-                primitive,
-                at: NOWHERE,
-            });
-        }
     }
 
     /// Resolves what could not be while reading.
@@ -1028,41 +655,70 @@ impl<'t> Reader<'t> {
         }
     }
 
-    /// Loads every image once.
+    /// Reads every image once, whatever its paths.
     fn read_textures(&mut self, resolve: &Resolve<'_>) {
-        let mut known: HashMap<&[u8], Option<u32>> = HashMap::new();
+        let (scene, report) = (&mut self.scene, &mut self.blocks.report);
+        let mut by_path: HashMap<&[u8], Option<u32>> = HashMap::new();
+        let mut by_content: HashMap<blake3::Hash, u32> = HashMap::new();
         for (material, name) in std::mem::take(&mut self.texture_names) {
-            let index = *known.entry(name.bytes).or_insert_with(|| {
-                let path = String::from_utf8_lossy(name.bytes).into_owned();
-                match resolve(&path).map_err(|error| error.to_string()).and_then(|bytes| {
-                    texture::read_texture(&path, &bytes).map_err(|error| error.to_string())
-                }) {
-                    Ok(texture) => {
-                        self.scene.textures.push(texture);
-                        Some(self.scene.textures.len() as u32 - 1)
+            let index = *by_path.entry(name.bytes).or_insert_with(|| {
+                let path = String::from_utf8_lossy(name.bytes);
+                let mut read = || {
+                    let bytes = resolve(&path).map_err(|error| error.to_string())?;
+                    let hash = blake3::hash(&bytes);
+                    if let Some(&index) = by_content.get(&hash) {
+                        return Ok(index);
                     }
-                    Err(error) => {
-                        self.blocks.report.error(name.span(), || {
-                            format!("cannot read the texture {}: {error}", shown(name.bytes))
-                        });
-                        None
-                    }
-                }
+                    let texture =
+                        texture::read_texture(&path, &bytes).map_err(|error| error.to_string())?;
+                    let index = scene.textures.len() as u32;
+                    scene.textures.push(texture);
+                    by_content.insert(hash, index);
+                    Ok(index)
+                };
+                let told = |error: String| {
+                    report.error(name.span(), || {
+                        format!("cannot read the texture {}: {error}", shown(name.bytes))
+                    });
+                };
+                read().map_err(told).ok()
             });
-            self.scene.materials[material as usize].texture = index;
+            scene.materials[material as usize].texture = index;
         }
     }
 
+    /// Reads every mesh file once, whatever its paths.
     fn read_meshes(&mut self, resolve: &Resolve<'_>) {
-        for (mesh, words) in self.scene.meshes.iter_mut().zip(&self.mesh_words) {
-            let shape = resolve(&mesh.path).map_err(|error| error.to_string()).and_then(|bytes| {
-                mesh_file::read_mesh(&mesh.path, &bytes).map_err(|error| error.to_string())
+        let (scene, report) = (&mut self.scene, &mut self.blocks.report);
+        let mut by_path: HashMap<&[u8], Option<Arc<MeshShape>>> = HashMap::new();
+        let mut by_content: HashMap<blake3::Hash, Arc<MeshShape>> = HashMap::new();
+        for (mesh, words) in scene.meshes.iter_mut().zip(&self.mesh_words) {
+            let name = words.file;
+            let shape = by_path.entry(name.bytes).or_insert_with(|| {
+                let path = String::from_utf8_lossy(name.bytes);
+                let mut read = || {
+                    let bytes = resolve(&path).map_err(|error| error.to_string())?;
+                    let hash = blake3::hash(&bytes);
+                    if let Some(shape) = by_content.get(&hash) {
+                        return Ok(Arc::clone(shape));
+                    }
+                    let MeshFile { shape, dropped } =
+                        mesh_file::read_mesh(&path, &bytes).map_err(|error| error.to_string())?;
+                    scene.dropped.zero_area += dropped.zero_area;
+                    scene.dropped.duplicates += dropped.duplicates;
+                    let shape = Arc::new(shape);
+                    by_content.insert(hash, Arc::clone(&shape));
+                    Ok(shape)
+                };
+                let told = |error: String| {
+                    report.error(name.span(), || {
+                        format!("cannot read the mesh {}: {error}", shown(name.bytes))
+                    });
+                };
+                read().map_err(told).ok()
             });
-            match shape {
-                Ok(shape) => (mesh.vertices, mesh.triangles) = (shape.vertices, shape.triangles),
-                Err(error) => self.blocks.report.error(words.file.span(), || {
-                    format!("cannot read the mesh {}: {error}", shown(words.file.bytes))
-                }),
+            if let Some(shape) = shape {
+                mesh.shape = Arc::clone(shape);
             }
         }
     }
@@ -1086,23 +742,10 @@ impl<'t> Reader<'t> {
 }
 
 /// Stands for places until they are known.
-const NOWHERE: scene::Place = scene::Place { line: 0, column: 0 };
-
-/// The largest condition number of a parallelepiped: beyond, less than four digits of a hit
-/// would be right.
-const MOST_SHEARED: f64 = 1e12;
-
-fn operation(block: Block) -> Option<Operation> {
-    match block {
-        Block::Union => Some(Operation::Union),
-        Block::Intersection => Some(Operation::Intersection),
-        Block::Difference => Some(Operation::Difference),
-        _ => None,
-    }
-}
+pub(crate) const NOWHERE: scene::Place = scene::Place { line: 0, column: 0 };
 
 /// A keyword in a sentence.
-fn plain(word: Word<'_>) -> String {
+pub(crate) fn plain(word: Word<'_>) -> String {
     String::from_utf8_lossy(word.bytes).into_owned()
 }
 
@@ -1113,42 +756,54 @@ fn is_identifier(name: &[u8]) -> bool {
         && name.chars().next().is_some_and(|first| first == '_' || first.is_alphabetic())
 }
 
-/// Reports what makes the text no UTF-8.
-fn check_encoding(text: &[u8], report: &mut Report) {
+/// Reports what makes the text no UTF-8; whether its words may make sense all the same.
+fn check_encoding(text: &[u8], report: &mut Report) -> bool {
+    let head = &text[..text.len().min(1024)];
     if let [0x1f, 0x8b, ..] = text {
         report.error(0..2, || "this file is compressed by gzip; unpack it first".into());
-    } else if let [0xff, 0xfe, ..] | [0xfe, 0xff, ..] = text {
+        return false;
+    }
+    if let [0xff, 0xfe, ..] | [0xfe, 0xff, ..] = text {
         report.error(0..2, || "this file is in UTF-16; save it as UTF-8".into());
-    } else if let Err(error) = std::str::from_utf8(text) {
+        return false;
+    }
+    if let Some(at) = memchr::memchr(0, head) {
+        report.error(at..at + 1, || "a NUL byte stands here: this file is no text".into());
+        return false;
+    }
+    if let Err(error) = std::str::from_utf8(text) {
         let at = error.valid_up_to();
         let length = error.error_len().unwrap_or(text.len() - at);
         report.error(at..at + length, || {
             format!("the byte 0x{:02x} is no UTF-8; save the file as UTF-8", text[at])
         });
     }
+    true
 }
 
-/// Whether no word of the text can make sense.
-fn is_other_format(text: &[u8]) -> bool {
-    matches!(text, [0x1f, 0x8b, ..] | [0xff, 0xfe, ..] | [0xfe, 0xff, ..])
-}
-
-fn check_viewport(viewport: &Viewport, opening: Word<'_>, report: &mut Report) {
+fn check_viewport(
+    viewport: &Viewport,
+    eye_word: Word<'_>,
+    corner_word: Word<'_>,
+    report: &mut Report,
+) {
     let Viewport { eye, top_left, bottom_left, top_right } = *viewport;
     if exact::is_collinear(top_left, bottom_left, top_right) {
-        report.error(opening.span(), || "the three corners of the screen are on one line".into());
+        report
+            .error(corner_word.span(), || "the three corners of the screen are on one line".into());
     } else if exact::is_coplanar(top_left, bottom_left, top_right, eye) {
-        report.error(opening.span(), || "the eye, `origin`, is in the plane of the screen".into());
+        report.error(eye_word.span(), || "the eye, `origin`, is in the plane of the screen".into());
     } else if ![bottom_left - top_left, top_right - top_left, eye - top_left]
         .iter()
         .all(|edge| edge.is_finite())
     {
-        report.error(opening.span(), || "this viewport is too large to be computed with".into());
+        report
+            .error(corner_word.span(), || "this viewport is too large to be computed with".into());
     } else {
         let (left, top) = (direction(bottom_left - top_left), direction(top_right - top_left));
         let cosine = left.dot(top);
         if cosine.abs() > RIGHT_ANGLE {
-            report.warn(opening.span(), || {
+            report.warn(corner_word.span(), || {
                 "the screen is no rectangle: its edges at `topleft` are not at a right angle; rendered sheared"
                     .into()
             });
@@ -1159,18 +814,3 @@ fn check_viewport(viewport: &Viewport, opening: Word<'_>, report: &mut Report) {
 /// The largest cosine that passes for a right angle: it shears the largest picture by less than
 /// a pixel.
 const RIGHT_ANGLE: f64 = 1e-5;
-
-/// A vector of length 1 along `vector`, however long that is.
-fn direction(vector: DVec3) -> DVec3 {
-    let scaled = vector / vector.abs().max_element();
-    scaled / scaled.length()
-}
-
-/// The condition number (Frobenius) of three edges, each taken as long as the others: how much
-/// more the inverse of a sheared box errs than that of an upright one.
-fn condition(edges: [DVec3; 3]) -> f64 {
-    let [a, b, c] = edges.map(direction);
-    let faces = [b.cross(c), c.cross(a), a.cross(b)];
-    let area: f64 = faces.iter().map(|face| face.length_squared()).sum();
-    (3.0 * area).sqrt() / a.dot(faces[0]).abs()
-}

@@ -2,7 +2,7 @@
 //! every shape has the extent that its type promises. Only [`crate::read`] makes one from text;
 //! whoever makes one by hand keeps the invariants written at each field.
 
-use std::fmt;
+use std::{fmt, sync::Arc};
 
 use glam::{DVec2, DVec3};
 
@@ -241,10 +241,8 @@ pub enum Operation {
 pub struct Mesh {
     /// The path as the scene has it.
     pub path: String,
-    /// The corners that triangles share, before the transform.
-    pub vertices: MeshVertices,
-    /// Indices of corners, counter-clockwise seen from the front.
-    pub triangles: Vec<[u32; 3]>,
+    /// Before the transform. All meshes of one file share it.
+    pub shape: Arc<MeshShape>,
     /// Applied first. Above 0.
     pub scale: f64,
     /// Applied second: an axis, not zero, and an angle in degrees, right-handed.
@@ -257,6 +255,16 @@ pub struct Mesh {
     pub primitive: u32,
     /// Where it begins in the file.
     pub at: Place,
+}
+
+/// What a mesh file holds.
+#[derive(Debug, Clone, PartialEq)]
+pub struct MeshShape {
+    /// The corners that triangles share, no two in one place.
+    pub vertices: MeshVertices,
+    /// Indices of corners, counter-clockwise seen from the front. At least one; of an area above
+    /// zero, each only once.
+    pub triangles: Vec<[u32; 3]>,
 }
 
 /// A mesh's corners in the precision of its file.

@@ -2,49 +2,87 @@
 
 use std::io::Cursor;
 
-use image::{ImageReader, Limits};
+use image::{ImageFormat, ImageReader, Limits};
 
 use crate::scene::Texture;
 
 /// Why an image file is no texture.
 #[derive(Debug, thiserror::Error)]
 pub enum TextureError {
-    /// Its first bytes are those of none of the formats, nor is its name.
-    #[error("it is no PNG, JPEG, BMP, TGA or WebP")]
+    /// Neither its bytes nor its name are those of a format.
+    #[error("it is no PNG, JPEG, BMP, TGA or WebP file")]
     UnknownFormat,
-    /// It is broken, or larger than [`MOST_TEXELS`] and [`MOST_BYTES`] allow.
+    /// It is broken.
     #[error("{0}")]
     Image(#[from] image::ImageError),
     /// It has no texels.
     #[error("it has no texels")]
     Empty,
+    /// It would take memory out of all proportion to its file.
+    #[error("it has {width} x {height} texels in {bytes} bytes: a bomb")]
+    Bomb {
+        /// Its width in texels.
+        width: u32,
+        /// Its height in texels.
+        height: u32,
+        /// The length of its file.
+        bytes: usize,
+    },
+    /// It would take too much memory.
+    #[error(
+        "it has {width} x {height} texels; at most {MOST_TEXELS} are read, in sides of at most {LONGEST_SIDE}"
+    )]
+    TooLarge {
+        /// Its width in texels.
+        width: u32,
+        /// Its height in texels.
+        height: u32,
+    },
 }
 
 /// The longest side of a texture, in texels.
 pub const LONGEST_SIDE: u32 = 65_535;
 
-/// The memory that decoding an image may take.
-pub const MOST_BYTES: u64 = 1 << 30;
+/// The most texels that a texture has: a square of 16 384.
+pub const MOST_TEXELS: u64 = 1 << 28;
 
-/// Decodes the bytes of an image file. The name tells the format where the bytes do not.
+/// Texels that any file may have, however short.
+const HARMLESS_TEXELS: u64 = 1 << 22;
+
+/// Texels that a longer file may have for each of its bytes. A PNG of one colour has 344.
+const MOST_TEXELS_A_BYTE: u64 = 400;
+
+/// The memory that a decoder may take besides.
+const MOST_BYTES: u64 = 1 << 30;
+
+/// Decodes the bytes of an image file. They tell the format; of TGA, which has no mark, the name
+/// does.
 pub fn read_texture(path: &str, bytes: &[u8]) -> Result<Texture, TextureError> {
-    let mut reader =
-        ImageReader::new(Cursor::new(bytes)).with_guessed_format().expect("memory is always read");
-    if reader.format().is_none() {
-        let format =
-            image::ImageFormat::from_path(path).map_err(|_| TextureError::UnknownFormat)?;
-        reader.set_format(format);
+    let format = match image::guess_format(bytes) {
+        Ok(format) => format,
+        Err(_) => ImageFormat::from_path(path).map_err(|_| TextureError::UnknownFormat)?,
+    };
+    if !format.reading_enabled() {
+        return Err(TextureError::UnknownFormat);
     }
-    let mut limits = Limits::no_limits();
-    limits.max_image_width = Some(LONGEST_SIDE);
-    limits.max_image_height = Some(LONGEST_SIDE);
-    limits.max_alloc = Some(MOST_BYTES);
-    reader.limits(limits);
-    let image = reader.decode()?.into_rgb8();
-    let (width, height) = image.dimensions();
+    let (width, height) = ImageReader::with_format(Cursor::new(bytes), format).into_dimensions()?;
     if width == 0 || height == 0 {
         return Err(TextureError::Empty);
     }
-    let texels = image.pixels().map(|texel| texel.0).collect();
-    Ok(Texture { path: path.to_owned(), width, height, texels })
+    let texel_count = u64::from(width) * u64::from(height);
+    if width.max(height) > LONGEST_SIDE || texel_count > MOST_TEXELS {
+        return Err(TextureError::TooLarge { width, height });
+    }
+    if texel_count > HARMLESS_TEXELS.max(MOST_TEXELS_A_BYTE * bytes.len() as u64) {
+        return Err(TextureError::Bomb { width, height, bytes: bytes.len() });
+    }
+    let mut reader = ImageReader::with_format(Cursor::new(bytes), format);
+    let mut limits = Limits::no_limits();
+    // Decoders count what they give as well: at most 16 bytes a texel.
+    limits.max_alloc = Some(MOST_BYTES + 16 * texel_count);
+    reader.limits(limits);
+    let image = reader.decode()?.into_rgb8();
+    let texels = image.into_raw();
+    let (texels, _) = texels.as_chunks::<3>();
+    Ok(Texture { path: path.to_owned(), width, height, texels: texels.to_vec() })
 }

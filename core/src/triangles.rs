@@ -3,15 +3,15 @@
 //! not plain and leaves it to the reader of all blocks, so that there is one place that knows
 //! about mistakes, and any number of threads reads the same scene.
 
-use std::hash::{BuildHasher, RandomState};
-
 use glam::{DVec2, DVec3};
 use hashbrown::{HashTable, hash_table::Entry};
 use rayon::prelude::*;
 
 use crate::{
     exact::is_collinear,
-    lexer::{Class, Lexer, Quotes, Word, class, parse_number},
+    hash::{mix, random_key, spread},
+    lexer::{Class, Lexer, Quotes, Word, class},
+    number::scan_number,
     scene::{Dropped, Triangle},
     symbol::Symbols,
 };
@@ -45,7 +45,7 @@ impl Triangles {
             texcoords: Vec::new(),
             dropped: Dropped::default(),
             table: HashTable::new(),
-            key: RandomState::new().hash_one(0),
+            key: random_key(),
             parallel_from: 0,
         }
     }
@@ -120,27 +120,29 @@ impl Triangles {
         primitive: &mut u64,
         symbols: &mut Symbols<'t>,
     ) -> usize {
+        if (Scanner { text, at }).triangle().is_none() {
+            return at;
+        }
         let key = self.key;
-        let count = if at < self.parallel_from {
-            1
-        } else {
-            PIECES_A_THREAD * rayon::current_num_threads()
-        };
+        let threads = rayon::current_num_threads();
+        if at < self.parallel_from || threads == 1 {
+            let piece = Piece::parse(text, at, at.saturating_add(piece), key);
+            return self.adopt(&[piece], primitive, symbols);
+        }
+        let count = PIECES_A_THREAD * threads;
         let mut window = Window::parse(text, at, piece, count, key);
         loop {
-            let next_start = window.next_start;
             let (adopted, next) = rayon::join(
-                || self.adopt(&window, primitive, symbols),
-                || next_start.map(|start| Window::parse(text, start, piece, count, key)),
+                || self.adopt(&window.pieces, primitive, symbols),
+                || window.is_whole.then(|| Window::parse(text, window.end, piece, count, key)),
             );
+            if adopted < window.end {
+                // Up to two windows were parsed in vain: read twice as far before trying again.
+                self.parallel_from = adopted.saturating_add(4 * count * piece);
+            }
             match next {
-                Some(next) if next_start == Some(adopted) => window = next,
-                Some(_) => {
-                    // Up to two windows were parsed in vain: read twice as far before trying again.
-                    self.parallel_from = adopted.saturating_add(4 * count * piece);
-                    return adopted;
-                }
-                None => return adopted,
+                Some(next) if window.end == adopted => window = next,
+                _ => return adopted,
             }
         }
     }
@@ -149,12 +151,12 @@ impl Triangles {
     /// have given; the answer is where that ends.
     fn adopt<'t>(
         &mut self,
-        window: &Window<'t>,
+        pieces: &[Piece<'t>],
         primitive: &mut u64,
         symbols: &mut Symbols<'t>,
     ) -> usize {
-        let mut at = window.pieces[0].start;
-        for piece in &window.pieces {
+        let mut at = pieces[0].start;
+        for piece in pieces {
             if piece.start != at || *primitive + u64::from(piece.count) > u64::from(u32::MAX) {
                 break;
             }
@@ -186,31 +188,33 @@ const PIECES_A_THREAD: usize = 2;
 struct Window<'t> {
     /// At least one.
     pieces: Vec<Piece<'t>>,
-    /// Where the next window begins if all is plain up to there; `None` when nobody can tell.
-    next_start: Option<usize>,
+    /// Where the last piece ends if all is plain up to there.
+    end: usize,
+    /// Whether another window may begin at the end.
+    is_whole: bool,
 }
 
 impl<'t> Window<'t> {
     /// Parses up to `count` pieces from byte `at`.
     fn parse(text: &'t [u8], at: usize, piece: usize, count: usize, key: u64) -> Self {
-        let mut starts = vec![at];
-        while starts.len() < count + 1
-            && let Some(start) =
-                find_triangle_line(text, starts[starts.len() - 1].saturating_add(piece), piece)
+        let mut bounds = vec![at];
+        let mut end = at;
+        while bounds.len() <= count
+            && let Some(start) = find_triangle_line(text, end.saturating_add(piece), piece)
         {
-            starts.push(start);
+            bounds.push(start);
+            end = start;
         }
-        let is_whole = starts.len() == count + 1;
-        let next_start = (is_whole && count > 1).then(|| starts[count]);
+        let is_whole = bounds.len() > count;
         if !is_whole {
-            let last = starts[starts.len() - 1];
-            starts.push(last.saturating_add(piece).min(text.len()));
+            end = end.saturating_add(piece).min(text.len());
+            bounds.push(end);
         }
-        let pieces = starts
+        let pieces = bounds
             .par_windows(2)
             .map(|bounds| Piece::parse(text, bounds[0], bounds[1], key))
             .collect();
-        Self { pieces, next_start }
+        Self { pieces, end, is_whole }
     }
 }
 
@@ -220,7 +224,7 @@ fn find_triangle_line(text: &[u8], from: usize, reach: usize) -> Option<usize> {
     memchr::memchr_iter(b'\n', text.get(from..end)?)
         .map(|line_end| {
             let mut scanner = Scanner { text, at: from + line_end + 1 };
-            while matches!(scanner.byte(), b' ' | b'\t') {
+            while matches!(text.get(scanner.at), Some(b' ' | b'\t')) {
                 scanner.at += 1;
             }
             scanner.at
@@ -246,14 +250,12 @@ struct Piece<'t> {
 impl<'t> Piece<'t> {
     /// Parses from `start`; no block begins at `end` or behind it.
     fn parse(text: &'t [u8], start: usize, end: usize, key: u64) -> Self {
-        // The shortest blocks that people write have some 100 bytes.
-        let expected = (end - start) / 128;
         let mut piece = Self {
             start,
             stop: start,
             count: 0,
-            triangles: Vec::with_capacity(expected),
-            hashes: Vec::with_capacity(expected),
+            triangles: Vec::new(),
+            hashes: Vec::new(),
             names: Vec::new(),
         };
         let mut scanner = Scanner { text, at: start };
@@ -359,62 +361,12 @@ impl<'t> Scanner<'t> {
     }
 
     /// Reads a finite number and the space behind it.
-    ///
-    /// Source of the short way: Clinger, "How to Read Floating Point Numbers Accurately" (1990):
-    /// whole numbers below 2^53 and powers of ten up to 10^22 are exact, so that one division
-    /// rounds once.
     fn number(&mut self) -> Option<f64> {
-        let start = self.at;
-        let mut byte = self.byte();
-        let is_negative = byte == b'-';
-        if is_negative || byte == b'+' {
-            self.at += 1;
-            byte = self.byte();
-        }
-        let digits_start = self.at;
-        let mut mantissa = 0_u64;
-        while byte.is_ascii_digit() {
-            mantissa = mantissa.wrapping_mul(10).wrapping_add(u64::from(byte - b'0'));
-            self.at += 1;
-            byte = self.byte();
-        }
-        let mut digit_count = self.at - digits_start;
-        let mut decimals = 0;
-        if byte == b'.' {
-            self.at += 1;
-            let decimals_start = self.at;
-            byte = self.byte();
-            while byte.is_ascii_digit() {
-                mantissa = mantissa.wrapping_mul(10).wrapping_add(u64::from(byte - b'0'));
-                self.at += 1;
-                byte = self.byte();
-            }
-            decimals = self.at - decimals_start;
-            digit_count += decimals;
-        }
-        let number = if digit_count > 0
-            && digit_count <= 19
-            && mantissa <= 1 << 53
-            && decimals < POWERS_OF_TEN.len()
-            && matches!(class(byte), Class::Space | Class::Comment)
-        {
-            let size = mantissa as f64 / POWERS_OF_TEN[decimals];
-            if is_negative { 0.0 - size } else { size }
-        } else {
-            while class(self.byte()) == Class::Word {
-                self.at += 1;
-            }
-            parse_number(&self.text[start..self.at]).filter(|number| number.is_finite())?
-        };
+        let number = scan_number(self.text, &mut self.at)?;
         self.skip_space()?;
         Some(number)
     }
 }
-
-const POWERS_OF_TEN: [f64; 23] = [
-    1e0, 1e1, 1e2, 1e3, 1e4, 1e5, 1e6, 1e7, 1e8, 1e9, 1e10, 1e11, 1e12, 1e13, 1e14, 1e15, 1e16,
-    1e17, 1e18, 1e19, 1e20, 1e21, 1e22,
-];
 
 /// Whether two triangles are the same but for the vertex that they begin with.
 fn is_copy(
@@ -462,13 +414,100 @@ fn hash_vertices(vertices: &[DVec3; 3], key: u64) -> u64 {
     hash
 }
 
-/// Mixes `word` into a hash: both halves of a product, which hang on all bits of both factors.
-fn mix(hash: u64, word: u64) -> u64 {
-    let product = u128::from(hash ^ word) * 0x9e37_79b9_7f4a_7c15;
-    (product as u64) ^ (product >> 64) as u64
-}
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::read::{Reading, read_scene_in_pieces};
 
-/// Half a hash as a whole one: tables take the place from the low bits and a tag from the high.
-fn spread(half: u32) -> u64 {
-    u64::from(half) | u64::from(half) << 32
+    /// Reads with pieces of a few bytes on two threads, with whole pieces on one thread, and
+    /// compares.
+    fn check_same(text: &str) -> Reading {
+        let read = |threads: usize, piece: usize| {
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+            pool.install(|| {
+                read_scene_in_pieces(
+                    text.as_bytes(),
+                    &|_| Err(std::io::ErrorKind::NotFound.into()),
+                    piece,
+                )
+            })
+        };
+        let expected = read(1, usize::MAX);
+        for (threads, piece) in [(1, 1), (2, 1), (2, 100), (3, 333), (2, 1000), (2, PIECE)] {
+            let reading = read(threads, piece);
+            assert_eq!(
+                reading.diagnostics, expected.diagnostics,
+                "{threads} threads, pieces of {piece}"
+            );
+            assert_eq!(reading.omitted, expected.omitted);
+            assert_eq!(format!("{:?}", reading.scene), format!("{:?}", expected.scene));
+        }
+        expected
+    }
+
+    fn scene(shapes: impl IntoIterator<Item = String>) -> String {
+        let shapes: String = shapes.into_iter().collect();
+        format!(
+            "materials entry name a endentry entry name b endentry endmaterials\ngeometry\n{shapes}endgeometry\n"
+        )
+    }
+
+    fn triangle(k: usize) -> String {
+        let material = ["a", "b", "b"][k % 3];
+        format!(
+            "triangle\n\tvertex 0 0 {k}\n\tvertex 1 0 {k}.5\n\tvertex 0 1 {k}e-1\n\tmaterial {material}\nendtriangle\n"
+        )
+    }
+
+    #[test]
+    fn pieces_give_what_the_whole_gives() {
+        let reading = check_same(&scene((0..1000).map(triangle)));
+        assert_eq!(reading.scene.unwrap().triangles.len(), 1000);
+    }
+
+    #[test]
+    fn copies_and_flat_ones_are_found_across_pieces() {
+        let flat = "triangle vertex 0 0 0 vertex 1 1 1 vertex 2 2 2 material a endtriangle\n";
+        let reading = check_same(&scene(
+            (0..1000).map(|k| if k % 7 == 0 { flat.into() } else { triangle(k % 400) }),
+        ));
+        let scene = reading.scene.unwrap();
+        assert_eq!(
+            (scene.dropped.zero_area, scene.dropped.zero_area + scene.dropped.duplicates),
+            (143, 600)
+        );
+    }
+
+    #[test]
+    fn anything_between_plain_triangles_is_read() {
+        let odd = [
+            "# a comment\n triangle\n",
+            "sphere coords 0 0 0 radius 1 material a endsphere\n",
+            "triangle vertex 0 0 0 texcoord 0 0 vertex 1 0 0 texcoord 1 0 vertex 0 1 0 texcoord 0 1 material b endtriangle",
+            "triangle material a vertex 0 0 0 vertex 1 0 0 vertex 0 1 0 endtriangle triangle\n",
+            "triangle vertex 0 0 0\n vertex 1 0 0 vertex 0 1 x\n material\ntriangle\nendtriangle\n",
+            "union\n\n",
+            "endtriangle\n",
+            "endgeometry\ngeometry\n",
+            "triangle vertex 0 0 0 vertex 1 0 0 vertex 0 1 1e999 material a endtriangle\n",
+            "triangle vertex 0 0 0 vertex 1 0 0 vertex 0 1 0 material unknown endtriangle\n",
+            "fog\ntriangle\nendfog\n",
+            "… \u{a0}",
+        ];
+        for odd in odd {
+            for every in [1, 10, 97] {
+                check_same(&scene(
+                    (0..200).map(|k| {
+                        format!("{}{}", if k % every == 0 { odd } else { "" }, triangle(k))
+                    }),
+                ));
+            }
+        }
+    }
+
+    #[test]
+    fn triangles_on_one_line_are_read() {
+        let reading = check_same(&scene((0..500).map(|k| triangle(k).replace('\n', " "))));
+        assert_eq!(reading.scene.unwrap().triangles.len(), 500);
+    }
 }

@@ -7,7 +7,7 @@ use rtfarm_core::scene::{Mesh, MeshVertices};
 /// a mesh is rotated, another way to compute it may differ by ulps.
 pub fn mesh_triangles(mesh: &Mesh) -> Vec<[DVec3; 3]> {
     let corner = |index: u32| {
-        let stored = match &mesh.vertices {
+        let stored = match &mesh.shape.vertices {
             MeshVertices::Single(vertices) => vertices[index as usize].map(f64::from),
             MeshVertices::Double(vertices) => vertices[index as usize],
         };
@@ -15,7 +15,7 @@ pub fn mesh_triangles(mesh: &Mesh) -> Vec<[DVec3; 3]> {
         let turned = mesh.rotate.map_or(scaled, |(axis, degrees)| rotate(scaled, axis, degrees));
         turned + mesh.offset
     };
-    mesh.triangles.iter().map(|corners| corners.map(corner)).collect()
+    mesh.shape.triangles.iter().map(|corners| corners.map(corner)).collect()
 }
 
 /// Source: Rodrigues, "Des lois géométriques qui régissent les déplacements d'un système solide"
@@ -28,7 +28,9 @@ fn rotate(point: DVec3, axis: DVec3, degrees: f64) -> DVec3 {
 
 #[cfg(test)]
 mod tests {
-    use rtfarm_core::scene::Place;
+    use std::sync::Arc;
+
+    use rtfarm_core::scene::{MeshShape, Place};
 
     use super::*;
 
@@ -36,8 +38,10 @@ mod tests {
     fn a_mesh_is_scaled_then_turned_then_moved() {
         let mesh = Mesh {
             path: String::new(),
-            vertices: MeshVertices::Single(vec![[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0; 3]]),
-            triangles: vec![[0, 1, 2]],
+            shape: Arc::new(MeshShape {
+                vertices: MeshVertices::Single(vec![[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0; 3]]),
+                triangles: vec![[0, 1, 2]],
+            }),
             scale: 2.0,
             rotate: Some((DVec3::new(0.0, 0.0, 5.0), 90.0)),
             offset: DVec3::new(0.0, 0.0, 3.0),
