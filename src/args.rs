@@ -32,13 +32,48 @@ pub(crate) enum Command {
     Worker(WorkerArgs),
     /// Have a farm render a scene.
     Submit(SubmitArgs),
+    /// Say what is wrong with a scene, and what it needs.
+    Check(CheckArgs),
+}
+
+/// Which scene, and how it is read.
+#[derive(Debug, ClapArgs)]
+pub(crate) struct SceneArgs {
+    /// The scene's file; `-` reads it from standard input.
+    #[arg(value_name = "SCENE")]
+    pub(crate) path: PathBuf,
+
+    /// Make an error of every warning.
+    #[arg(long)]
+    pub(crate) strict: bool,
+}
+
+impl SceneArgs {
+    /// The scene as messages call it.
+    pub(crate) fn name(&self) -> String {
+        if self.is_from_stdin() { "<stdin>".to_owned() } else { self.path.display().to_string() }
+    }
+
+    pub(crate) fn is_from_stdin(&self) -> bool {
+        self.path.as_os_str() == "-"
+    }
+}
+
+#[derive(Debug, ClapArgs)]
+pub(crate) struct CheckArgs {
+    #[command(flatten)]
+    pub(crate) scene: SceneArgs,
+
+    /// Answer in JSON.
+    #[arg(long)]
+    pub(crate) json: bool,
 }
 
 /// What picture is wanted.
 #[derive(Debug, ClapArgs)]
 pub(crate) struct PictureArgs {
-    /// The scene's file; `-` reads it from standard input.
-    pub(crate) scene: PathBuf,
+    #[command(flatten)]
+    pub(crate) scene: SceneArgs,
 
     /// Where the picture goes; the extension, .png or .exr, says how it is written.
     #[arg(short, long = "output", value_name = "FILE")]
@@ -208,7 +243,8 @@ impl PictureArgs {
     /// What is wanted of the scene.
     pub(crate) fn wish(&self, format: PictureFormat) -> Wish {
         Wish {
-            name: self.scene_name(),
+            name: self.scene.name(),
+            strict: self.scene.strict,
             size: self.size,
             samples: self.samples,
             seed: self.seed,
@@ -217,15 +253,6 @@ impl PictureArgs {
             tile_side: self.tile,
             format,
         }
-    }
-
-    /// The scene as messages call it.
-    pub(crate) fn scene_name(&self) -> String {
-        if self.is_from_stdin() { "<stdin>".to_owned() } else { self.scene.display().to_string() }
-    }
-
-    pub(crate) fn is_from_stdin(&self) -> bool {
-        self.scene.as_os_str() == "-"
     }
 }
 
@@ -254,6 +281,7 @@ impl Command {
             Self::Coordinator(args) => args.log_format,
             Self::Worker(args) => args.log_format,
             Self::Submit(args) => args.log_format,
+            Self::Check(_) => LogFormat::Text,
         }
     }
 }

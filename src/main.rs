@@ -1,6 +1,7 @@
 //! The command line: arguments, errors, exit codes.
 
 mod args;
+mod check;
 mod children;
 mod console;
 mod coordinator;
@@ -55,6 +56,7 @@ async fn run(command: Command, console: &Console) -> Result<(), Failure> {
         Command::Coordinator(args) => coordinator::run(args, &stop).await,
         Command::Worker(args) => worker::run(args, &stop).await,
         Command::Submit(args) => submit::run(args, console, &stop).await,
+        Command::Check(args) => check::run(args, console, &stop).await,
     }
 }
 

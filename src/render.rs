@@ -21,7 +21,7 @@ use tokio_util::sync::CancellationToken;
 
 use crate::{
     VERSION,
-    args::{PictureArgs, RenderArgs},
+    args::{PictureArgs, RenderArgs, SceneArgs},
     children::{Children, Setup},
     console::Console,
     failure::Failure,
@@ -77,7 +77,7 @@ pub(crate) async fn run(
     let started = Instant::now();
     let mut output = args.picture.output().map_err(Failure::Input)?;
     output.check()?;
-    let text = read_scene_text(&args.picture, stop).await?;
+    let text = read_text(&args.picture.scene, stop).await?;
     let order = place(&args.picture, &output, text, console, stop).await?;
     let summary = match args.workers_and_threads() {
         (0, threads) => render_here(order, threads, &args, &output, console, stop).await?,
@@ -88,16 +88,16 @@ pub(crate) async fn run(
 }
 
 /// Where the files are that a scene names: they are relative to its own.
-pub(crate) fn scene_folder(args: &PictureArgs) -> PathBuf {
-    if args.is_from_stdin() { ".".into() } else { folder_of(&args.scene) }
+pub(crate) fn scene_folder(scene: &SceneArgs) -> PathBuf {
+    if scene.is_from_stdin() { ".".into() } else { folder_of(&scene.path) }
 }
 
 /// Reads the scene's file or standard input.
-pub(crate) async fn read_scene_text(
-    args: &PictureArgs,
+pub(crate) async fn read_text(
+    scene: &SceneArgs,
     stop: &CancellationToken,
 ) -> Result<Vec<u8>, Failure> {
-    let (path, is_from_stdin) = (args.scene.clone(), args.is_from_stdin());
+    let (path, is_from_stdin) = (scene.path.clone(), scene.is_from_stdin());
     let read = spawn_blocking(move || {
         if is_from_stdin {
             let mut text = Vec::new();
@@ -112,7 +112,7 @@ pub(crate) async fn read_scene_text(
         text = read => text?,
         () = stop.cancelled() => return Err(Failure::Interrupted),
     };
-    Ok(text.with_context(|| format!("cannot read the scene {}", args.scene_name()))?)
+    Ok(text.with_context(|| format!("cannot read the scene {}", scene.name()))?)
 }
 
 /// Reads and prepares the scene, and tells its diagnostics.
@@ -124,8 +124,8 @@ async fn place(
     stop: &CancellationToken,
 ) -> Result<Order, Failure> {
     let wish = args.wish(output.format());
-    let folder = scene_folder(args);
-    let (name, style) = (args.scene_name(), Console::drawing_style());
+    let folder = scene_folder(&args.scene);
+    let (name, style) = (args.scene.name(), Console::drawing_style());
     let placing = spawn_blocking(move || {
         let placed = wish.place(&text, &|path: &str| fs::read(folder.join(Path::new(path))));
         let mut report = draw_diagnostics(&name, &text, &placed.diagnostics, style);
@@ -140,7 +140,7 @@ async fn place(
     order.map_err(|refusal| match refusal {
         Refusal::Scene => Failure::Told,
         Refusal::Other(reason) => {
-            Failure::Input(anyhow!("cannot render {}: {reason}", args.scene_name()))
+            Failure::Input(anyhow!("cannot render {}: {reason}", args.scene.name()))
         }
     })
 }

@@ -27,7 +27,7 @@ use crate::{
     console::Console,
     failure::Failure,
     output::Output,
-    render::{Summary, read_scene_text, scene_folder},
+    render::{Summary, read_text, scene_folder},
 };
 
 /// A scene may be large and take long to prepare.
@@ -46,7 +46,7 @@ pub(crate) async fn run(
     let started = Instant::now();
     let mut output = args.picture.output().map_err(Failure::Input)?;
     output.check()?;
-    let text = read_scene_text(&args.picture, stop).await?;
+    let text = read_text(&args.picture.scene, stop).await?;
     let channel = args.coordinator.connect().await;
     let channel =
         channel.with_context(|| format!("no coordinator answers at {}", args.coordinator))?;
@@ -91,11 +91,12 @@ async fn submit(
         samples: wish.samples,
         seed: wish.seed,
         flat: wish.flat,
+        strict: wish.strict,
         cutoff: wish.cutoff,
         tile_side: wish.tile_side.map_or(0, |side| side as u32),
         format: wire::Format::from(wish.format).into(),
     };
-    let folder = scene_folder(&args.picture);
+    let folder = scene_folder(&args.picture.scene);
     let (text, files) = spawn_blocking(move || {
         let files = named_files(&text, &folder);
         (text, files)

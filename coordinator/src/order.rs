@@ -18,6 +18,8 @@ pub const MOST_TILES: u32 = 1 << 20;
 pub struct Wish {
     /// What the scene is called in logs.
     pub name: String,
+    /// Every warning is an error.
+    pub strict: bool,
     /// The frame; the scene's own wish when missing.
     pub size: Option<Size>,
     /// Samples in every pixel.
@@ -72,7 +74,9 @@ pub enum Refusal {
 impl Wish {
     /// Reads and prepares the scene. This takes long: never call it on the async runtime.
     pub fn place(self, text: &[u8], resolve: &Resolve<'_>) -> Placed {
-        let Reading { scene, mut diagnostics, omitted } = read_scene(text, resolve);
+        let reading = read_scene(text, resolve);
+        let reading = if self.strict { reading.into_strict() } else { reading };
+        let Reading { scene, mut diagnostics, omitted } = reading;
         let order = match &scene {
             Some(scene) => self.prepare(scene, text, &mut diagnostics),
             None => Err(Refusal::Scene),

@@ -421,7 +421,7 @@ async fn receive(mut parts: Streaming<wire::SubmitRequest>) -> Result<Bundle, St
 fn to_wish(order: wire::Order) -> Result<Wish, WireError> {
     let format = order.format().try_into()?;
     let size = order.frame.map(Size::try_from).transpose()?;
-    let wire::Order { name, samples, seed, flat, cutoff, tile_side, .. } = order;
+    let wire::Order { name, samples, seed, flat, cutoff, strict, tile_side, .. } = order;
     if !rtfarm_proto::SAMPLES.contains(&samples) {
         return Err(WireError::Samples(samples));
     }
@@ -429,7 +429,7 @@ fn to_wish(order: wire::Order) -> Result<Wish, WireError> {
         return Err(WireError::Cutoff(cutoff));
     }
     let tile_side = (tile_side > 0).then_some(tile_side.into());
-    Ok(Wish { name, size, samples, seed, flat, cutoff, tile_side, format })
+    Ok(Wish { name, strict, size, samples, seed, flat, cutoff, tile_side, format })
 }
 
 fn to_event(progress: &Progress) -> wire::Event {

@@ -45,6 +45,24 @@ pub struct Scene {
     pub dropped: Dropped,
 }
 
+impl Scene {
+    /// What a picture may need of the tracer, and whether one of this scene does.
+    pub fn needs(&self) -> [(&'static str, bool); 9] {
+        let any = |holds: fn(&Material) -> bool| self.materials.iter().any(holds);
+        [
+            ("point lights", !self.lights.is_empty()),
+            ("ambient light", self.ambient.is_some()),
+            ("mirrors", any(|m| m.reflect > 0.0)),
+            ("transparency", any(|m| m.alpha < 1.0)),
+            ("refraction", any(|m| m.alpha < 1.0 && m.refract > 0.0 && m.refract != 1.0)),
+            ("textures", any(|m| m.texture.is_some())),
+            ("constructive solids", !self.solids.is_empty()),
+            ("meshes", !self.meshes.is_empty()),
+            ("secondary light", any(|m| m.reflect > 0.0) && !self.lights.is_empty()),
+        ]
+    }
+}
+
 /// Faces that were left out because they cannot be seen or stand there twice.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Dropped {
