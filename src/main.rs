@@ -1,3 +1,73 @@
-//! The command line.
+//! The command line: arguments, errors, exit codes.
 
-fn main() {}
+mod args;
+mod children;
+mod console;
+mod coordinator;
+mod failure;
+mod local;
+mod output;
+mod render;
+mod submit;
+mod worker;
+
+use std::process::ExitCode;
+
+use clap::Parser;
+use tokio::signal::unix::{SignalKind, signal};
+use tokio_util::sync::CancellationToken;
+
+use crate::{
+    args::{Args, Command},
+    console::Console,
+    failure::Failure,
+};
+
+/// The version that both ends of a farm must have.
+const VERSION: &str = env!("CARGO_PKG_VERSION");
+
+fn main() -> ExitCode {
+    let args = match Args::try_parse() {
+        Ok(args) => args,
+        Err(error) => return failure::explain_usage(&error),
+    };
+    let console = Console::new(&args.command);
+    let runtime =
+        tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build();
+    let runtime = match runtime {
+        Ok(runtime) => runtime,
+        Err(error) => return Failure::from(error).tell(&console),
+    };
+    // Local workers are started from this very thread, at whose end they would be killed.
+    let result = runtime.block_on(run(args.command, &console));
+    // What still blocks, such as a scene being read, is of no use to anyone.
+    runtime.shutdown_background();
+    match result {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(failure) => failure.tell(&console),
+    }
+}
+
+async fn run(command: Command, console: &Console) -> Result<(), Failure> {
+    let stop = stop_on_signals()?;
+    match command {
+        Command::Render(args) => render::run(args, console, &stop).await,
+        Command::Coordinator(args) => coordinator::run(args, &stop).await,
+        Command::Worker(args) => worker::run(args, &stop).await,
+        Command::Submit(args) => submit::run(args, console, &stop).await,
+    }
+}
+
+/// A token that is cancelled when somebody wants this process to end.
+fn stop_on_signals() -> Result<CancellationToken, Failure> {
+    let stop = CancellationToken::new();
+    for kind in [SignalKind::interrupt(), SignalKind::terminate(), SignalKind::hangup()] {
+        let mut signals = signal(kind)?;
+        let stop = stop.clone();
+        tokio::spawn(async move {
+            signals.recv().await;
+            stop.cancel();
+        });
+    }
+    Ok(stop)
+}

@@ -1,1 +1,19 @@
-//! To come.
+//! The coordinator of a farm: it takes orders, leases tiles to workers and stitches what they
+//! bring into pictures.
+//!
+//! `lease` and `jobs` decide and never wait; `service` and `run` are the shell around them.
+
+mod job;
+mod jobs;
+mod lease;
+mod log;
+mod order;
+mod run;
+mod service;
+mod store;
+
+pub use job::{End, Job, Progress};
+pub use log::{TileCost, log_tile};
+pub use order::{MOST_TILES, Order, Placed, Refusal, Wish};
+pub use run::{Config, Coordinator, Listener, SubmitError};
+pub use store::{folder_of, new_picture};

@@ -106,7 +106,8 @@ pub(crate) fn check_quadrangle(corners: [DVec3; 4]) -> Result<Option<f64>, Quadr
     let largest = corners.iter().map(|corner| corner.abs().max_element()).fold(0.0, f64::max);
     let shift = exponent(largest);
     let scaled = corners.map(|corner| corner.map(|number| scale_by_power(number, -shift)));
-    let normal = crate::scene::newell_normal(&scaled);
+    // Newell's normal; of a quadrangle it is the cross product of the diagonals.
+    let normal = (scaled[2] - scaled[0]).cross(scaled[3] - scaled[1]);
     if !is_simple(&corners, normal, &triples) {
         return Err(QuadrangleFault::Crossing);
     }

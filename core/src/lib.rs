@@ -3,24 +3,41 @@
 //!
 //! Nothing here opens files, reads a clock, uses sockets or starts threads other than rayon's.
 
+pub mod scene;
+
+// Text into a scene.
 mod block;
 mod diagnostic;
 mod exact;
 mod hash;
-pub mod isa;
 mod lexer;
 pub mod mesh_file;
 mod number;
 mod obj;
 mod ply;
 mod polygon;
-pub mod prepared;
 pub mod read;
-pub mod render;
-pub mod scene;
 mod shapes;
 mod stl;
 mod symbol;
 pub mod texture;
-pub mod tile;
 mod triangles;
+
+// A scene into a prepared scene.
+mod bvh;
+mod node;
+mod plane;
+pub mod prepared;
+mod weld;
+
+// A prepared scene into tiles.
+pub mod isa;
+pub mod picture;
+mod quadrangle;
+mod ray;
+pub mod render;
+pub mod sample;
+mod sphere;
+pub mod tile;
+pub mod trace;
+mod triangle;

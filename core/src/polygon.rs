@@ -4,10 +4,7 @@ use std::cmp::Ordering;
 
 use glam::{DVec2, DVec3};
 
-use crate::{
-    exact::{exponent, project, scale_by_power},
-    scene::newell_normal,
-};
+use crate::exact::{exponent, project, scale_by_power};
 
 /// Corners that a polygon which is not convex may have: cutting it up takes their square in time.
 pub(crate) const MOST_CORNERS: usize = 1024;
@@ -60,6 +57,15 @@ pub(crate) fn triangulate(points: &[DVec3], mut emit: impl FnMut([usize; 3])) ->
     }
     emit([ring.previous[corner], corner, ring.next[corner]]);
     true
+}
+
+/// Newell's normal of a polygon: twice its area, towards the side that sees it counter-clockwise.
+/// Source: Sutherland, Sproull & Schumacker, "A Characterization of Ten Hidden-Surface
+/// Algorithms" (1974), who credit M. E. Newell. Taken about the first corner, so that it does not
+/// lose digits far from the origin.
+fn newell_normal(points: &[DVec3]) -> DVec3 {
+    let from_first = |k: usize| points[k] - points[0];
+    (1..points.len() - 1).map(|k| from_first(k).cross(from_first(k + 1))).sum()
 }
 
 /// How a, b, c turn: `Greater` to the left. Rounded: files round the corners of their polygons

@@ -183,15 +183,6 @@ pub struct Quadrangle {
     pub primitive: u32,
 }
 
-/// Newell's normal of a polygon: twice its area, towards the side that sees it counter-clockwise.
-/// Source: Sutherland, Sproull & Schumacker, "A Characterization of Ten Hidden-Surface
-/// Algorithms" (1974), who credit M. E. Newell. Taken about the first vertex, so that it does not
-/// lose digits far from the origin.
-pub fn newell_normal(vertices: &[DVec3]) -> DVec3 {
-    let from_first = |k: usize| vertices[k] - vertices[0];
-    (1..vertices.len() - 1).map(|k| from_first(k).cross(from_first(k + 1))).sum()
-}
-
 /// A parallelepiped of a volume above zero; its front is its outside.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Parallelepiped {

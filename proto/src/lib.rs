@@ -1,1 +1,35 @@
-//! To come.
+//! What coordinator, workers and clients of a farm say to each other: the messages of
+//! `farm.proto`, names for what they number, their conversions to and from the core's types, and
+//! where a coordinator is found. Nothing is decided here.
+
+mod address;
+mod convert;
+mod name;
+
+pub use address::{Address, AddressError};
+pub use convert::{SAMPLES, WireError, pixels_from_bytes, pixels_to_bytes, scene_hash};
+pub use name::{Epoch, JobId, LeaseName, WorkerId};
+
+/// The generated messages, clients and servers.
+#[expect(
+    missing_docs,
+    clippy::pedantic,
+    clippy::allow_attributes_without_reason,
+    reason = "generated; farm.proto has the words"
+)]
+pub mod wire {
+    tonic::include_proto!("rtfarm.v1");
+}
+
+/// The version of `farm.proto`. Both sides must have the same, and the same package version.
+pub const PROTOCOL: u32 = 1;
+
+/// The largest message that either side takes: a tile of the largest side, 12 bytes a pixel, and
+/// room for what stands around it.
+pub const MESSAGE_BYTES: usize = 1024 * 1024 * 12 + (1 << 16);
+
+/// The size of a piece of a stream.
+pub const CHUNK_BYTES: usize = 1 << 20;
+
+/// How long a worker's question for tiles may wait for its answer.
+pub const LONGEST_WAIT: std::time::Duration = std::time::Duration::from_secs(10);

@@ -1,0 +1,113 @@
+//! An order: from a scene's text to what a job needs.
+
+use rtfarm_core::{
+    picture::PictureFormat,
+    prepared::{PrepareError, PreparedBytes, prepare},
+    read::{Diagnostic, Omitted, Reading, Resolve, Severity, read_scene},
+    render::Settings,
+    scene::Scene,
+    tile::{Size, TileGrid},
+};
+
+/// The most tiles that a picture may be cut into; each costs the coordinator some 100 bytes.
+pub const MOST_TILES: u32 = 1 << 20;
+
+/// What somebody wants rendered, before the scene is known.
+#[derive(Debug, Clone)]
+pub struct Wish {
+    /// What the scene is called in logs.
+    pub name: String,
+    /// The frame; the scene's own wish when missing.
+    pub size: Option<Size>,
+    /// Samples in every pixel.
+    pub samples: u32,
+    /// Chooses the random numbers.
+    pub seed: u64,
+    /// Plain colours.
+    pub flat: bool,
+    /// The side of a tile in pixels; chosen by the frame's size when missing.
+    pub tile_side: Option<u64>,
+    /// How the picture is written.
+    pub format: PictureFormat,
+}
+
+/// All that a job needs.
+#[derive(Debug)]
+pub struct Order {
+    /// What the scene is called in logs.
+    pub name: String,
+    /// The scene.
+    pub prepared: PreparedBytes,
+    /// What the picture depends on besides.
+    pub settings: Settings,
+    /// The frame and its tiles.
+    pub grid: TileGrid,
+    /// How the picture is written.
+    pub format: PictureFormat,
+}
+
+/// What came of a wish and a scene's text.
+#[derive(Debug)]
+pub struct Placed {
+    /// The order, or why there is none.
+    pub order: Result<Order, Refusal>,
+    /// What there is to tell the scene's author.
+    pub diagnostics: Vec<Diagnostic>,
+    /// What there is besides.
+    pub omitted: Omitted,
+}
+
+/// Why a wish is not granted.
+#[derive(Debug)]
+pub enum Refusal {
+    /// The diagnostics say it.
+    Scene,
+    /// The scene is innocent.
+    Other(String),
+}
+
+impl Wish {
+    /// Reads and prepares the scene. This takes long: never call it on the async runtime.
+    pub fn place(self, text: &[u8], resolve: &Resolve<'_>) -> Placed {
+        let Reading { scene, mut diagnostics, omitted } = read_scene(text, resolve);
+        let order = match &scene {
+            Some(scene) => self.prepare(scene, text, &mut diagnostics),
+            None => Err(Refusal::Scene),
+        };
+        Placed { order, diagnostics, omitted }
+    }
+
+    fn prepare(
+        self,
+        scene: &Scene,
+        text: &[u8],
+        diagnostics: &mut Vec<Diagnostic>,
+    ) -> Result<Order, Refusal> {
+        let other = |reason: String| Refusal::Other(reason);
+        let viewport = scene.viewport.ok_or(PrepareError::NoViewport);
+        let viewport = viewport.map_err(|error| other(error.to_string()))?;
+        let size = self.size.or(scene.size_hint).unwrap_or_else(|| viewport.default_size());
+        let grid = match self.tile_side {
+            Some(side) => TileGrid::new(size, side).map_err(|error| other(error.to_string()))?,
+            None => TileGrid::balanced(size),
+        };
+        if grid.count() > MOST_TILES {
+            return Err(other(format!(
+                "a picture is cut into at most {MOST_TILES} tiles; {size} in tiles of {side}x{side} \
+                 would be {count}",
+                side = grid.side(),
+                count = grid.count()
+            )));
+        }
+        let prepared = prepare(scene).map_err(|error| match error.place() {
+            Some(at) => {
+                let message = error.to_string();
+                diagnostics.push(Diagnostic::at_place(Severity::Error, text, at, message));
+                Refusal::Scene
+            }
+            None => other(error.to_string()),
+        })?;
+        let Self { name, samples, seed, flat, format, .. } = self;
+        Ok(Order { name, prepared, settings: Settings { size, samples, seed, flat }, grid, format })
+    }
+}

@@ -1,0 +1,188 @@
+//! The coordinator as its workers and clients meet it: real gRPC, workers that misbehave.
+
+use std::time::Duration;
+
+use rtfarm_coordinator::{Config, Coordinator, Listener};
+use rtfarm_proto::{
+    Address, LeaseName, PROTOCOL, pixels_to_bytes,
+    wire::{
+        self, event::End, farm_client::FarmClient, jobs_client::JobsClient, lease_response::Next,
+        submit_request::Part, submit_response::Outcome,
+    },
+};
+use tempfile::TempDir;
+use tokio::net::TcpListener;
+use tonic::{Code, transport::Channel};
+
+/// Nothing before the eye: a scene all the same.
+const SCENE: &str = "viewport\norigin 0 0 -2\ntopleft -1 1 0\nbottomleft -1 -1 0\ntopright 1 1 0\n\
+    background 10 20 30\nendviewport\n";
+
+const VERSION: &str = "1.2.3";
+
+/// A farm with one worker, played by the test, and one job of 2 x 1 tiles of 8 x 8 pixels.
+struct Farm {
+    _folder: TempDir,
+    tiles: FarmClient<Channel>,
+    jobs: JobsClient<Channel>,
+    worker: u32,
+    job: u64,
+}
+
+impl Farm {
+    async fn new() -> Self {
+        let folder = tempfile::tempdir().unwrap();
+        let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+        let address: Address =
+            format!("http://{}", listener.local_addr().unwrap()).parse().unwrap();
+        let coordinator = Coordinator::new(Config {
+            version: VERSION.to_owned(),
+            term: Duration::from_millis(300),
+            scene_folder: folder.path().to_owned(),
+            picture_folder: folder.path().to_owned(),
+        });
+        tokio::spawn(async move {
+            coordinator.run(Listener::Tcp(listener), std::future::pending()).await
+        });
+        let channel = address.connect().await.unwrap();
+        let (mut tiles, mut jobs) = (FarmClient::new(channel.clone()), JobsClient::new(channel));
+        let worker = tiles.join(join(VERSION)).await.unwrap().into_inner().worker;
+        let order = wire::Order {
+            version: VERSION.to_owned(),
+            protocol: PROTOCOL,
+            name: "test".to_owned(),
+            frame: Some(wire::Frame { width: 16, height: 8 }),
+            samples: 1,
+            tile_side: 8,
+            format: wire::Format::Png8.into(),
+            ..wire::Order::default()
+        };
+        let parts = [Part::Order(order), Part::Text(SCENE.into())]
+            .map(|part| wire::SubmitRequest { part: Some(part) });
+        let answer = jobs.submit(tokio_stream::iter(parts)).await.unwrap().into_inner();
+        let Some(Outcome::Accepted(accepted)) = answer.outcome else { panic!("{answer:?}") };
+        assert_eq!(accepted.tile_count, 2);
+        Self { _folder: folder, tiles, jobs, worker, job: accepted.job }
+    }
+
+    async fn lease(&mut self) -> (LeaseName, Vec<u32>) {
+        let request = wire::LeaseRequest { worker: self.worker, max_tiles: 64, wait_ms: 5000 };
+        match self.tiles.lease(request).await.unwrap().into_inner().next {
+            Some(Next::Run(run)) => (run.lease.unwrap().into(), run.tiles),
+            other => panic!("no tiles but {other:?}"),
+        }
+    }
+
+    async fn deliver(
+        &mut self,
+        lease: LeaseName,
+        tile: u32,
+        value: f32,
+    ) -> Result<wire::Verdict, Code> {
+        let pixels = pixels_to_bytes(&[[value; 3]; 64]);
+        let hash = blake3::hash(&pixels).as_bytes().to_vec();
+        self.send(lease, tile, pixels.to_vec(), hash).await
+    }
+
+    async fn send(
+        &mut self,
+        lease: LeaseName,
+        tile: u32,
+        pixels: Vec<u8>,
+        hash: Vec<u8>,
+    ) -> Result<wire::Verdict, Code> {
+        let delivery = wire::DeliverRequest {
+            worker: self.worker,
+            lease: Some(lease.into()),
+            tile,
+            pixels: pixels.into(),
+            hash: hash.into(),
+            rays: 64,
+            seconds: 0.1,
+        };
+        let answer = self.tiles.deliver(delivery).await;
+        answer.map(|answer| answer.into_inner().verdict()).map_err(|status| status.code())
+    }
+
+    /// The state of the job now.
+    async fn state(&mut self) -> wire::Event {
+        let request = wire::WatchRequest { job: self.job };
+        let mut events = self.jobs.watch(request).await.unwrap().into_inner();
+        events.message().await.unwrap().unwrap()
+    }
+}
+
+fn join(version: &str) -> wire::JoinRequest {
+    wire::JoinRequest {
+        version: version.to_owned(),
+        protocol: PROTOCOL,
+        nonce: 1,
+        threads: 1,
+        ..wire::JoinRequest::default()
+    }
+}
+
+#[tokio::test]
+async fn a_second_copy_that_differs_is_counted_and_changes_nothing() {
+    let mut farm = Farm::new().await;
+    let (lease, tiles) = farm.lease().await;
+    assert_eq!(farm.deliver(lease, tiles[0], 0.5).await, Ok(wire::Verdict::Accepted));
+    assert_eq!(farm.deliver(lease, tiles[0], 0.5).await, Ok(wire::Verdict::Duplicate));
+    assert_eq!(farm.state().await.differing_tiles, 0);
+    assert_eq!(farm.deliver(lease, tiles[0], 0.6).await, Ok(wire::Verdict::Duplicate));
+    let state = farm.state().await;
+    assert_eq!((state.differing_tiles, state.tiles_done), (1, 1));
+}
+
+#[tokio::test]
+async fn a_lease_without_progress_is_given_again_and_late_pixels_count() {
+    let mut farm = Farm::new().await;
+    let (late, tiles) = farm.lease().await;
+    let (second, again) = loop {
+        // The first run may hold one tile; the other is free until it is leased.
+        let (lease, more) = farm.lease().await;
+        if more.contains(&tiles[0]) {
+            break (lease, more);
+        }
+    };
+    let renewal = wire::RenewRequest { worker: farm.worker, leases: vec![late.into()] };
+    let lost = farm.tiles.renew(renewal).await.unwrap().into_inner().lost;
+    assert_eq!(lost, [late.into()]);
+    assert_eq!(farm.deliver(late, tiles[0], 0.5).await, Ok(wire::Verdict::Accepted));
+    assert_eq!(farm.deliver(second, again[0], 0.5).await, Ok(wire::Verdict::Duplicate));
+}
+
+#[tokio::test]
+async fn damaged_and_senseless_pixels_are_refused() {
+    let mut farm = Farm::new().await;
+    let (lease, tiles) = farm.lease().await;
+    let bytes = vec![0; 64 * 12];
+    let hash = blake3::hash(&bytes).as_bytes().to_vec();
+    assert_eq!(farm.send(lease, tiles[0], bytes, vec![0; 32]).await, Err(Code::DataLoss));
+    let short = vec![0; 13];
+    let short_hash = blake3::hash(&short).as_bytes().to_vec();
+    assert_eq!(farm.send(lease, tiles[0], short, short_hash).await, Err(Code::InvalidArgument));
+    let rejected = Ok(wire::Verdict::Rejected);
+    assert_eq!(farm.send(lease, 99, vec![0; 64 * 12], hash).await, rejected);
+    assert_eq!(farm.state().await.tiles_done, 0);
+
+    assert_eq!(farm.deliver(lease, tiles[0], f32::NAN).await, rejected);
+    let Some(End::Failed(reason)) = farm.state().await.end else { panic!("it goes on") };
+    assert!(reason.contains("is not a number"), "{reason}");
+}
+
+#[tokio::test]
+async fn strangers_are_told_what_is_wrong() {
+    let mut farm = Farm::new().await;
+    let status = farm.tiles.join(join("1.2.4")).await.unwrap_err();
+    assert_eq!(status.code(), Code::FailedPrecondition);
+    assert!(status.message().contains("rtfarm 1.2.4") && status.message().contains(VERSION));
+    let request = wire::LeaseRequest { worker: 77, max_tiles: 1, wait_ms: 0 };
+    assert_eq!(farm.tiles.lease(request).await.unwrap_err().code(), Code::NotFound);
+    let request = wire::FetchRequest { scene_hash: vec![1; 32].into() };
+    assert_eq!(farm.tiles.fetch(request).await.unwrap_err().code(), Code::NotFound);
+    let request = wire::WatchRequest { job: 77 };
+    assert_eq!(farm.jobs.watch(request).await.unwrap_err().code(), Code::NotFound);
+    let request = wire::ImageRequest { job: farm.job };
+    assert_eq!(farm.jobs.image(request).await.unwrap_err().code(), Code::FailedPrecondition);
+}

@@ -1,0 +1,238 @@
+//! Rays, and what they hit.
+
+use glam::DVec3;
+
+/// A half-line, with what it must not meet.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Ray {
+    /// Where it starts.
+    pub(crate) origin: DVec3,
+    /// Where it goes; of length 1 within rounding, never zero or NaN.
+    pub(crate) direction: DVec3,
+    /// Only hits nearer than this count. Above 0, may be infinite.
+    pub(crate) reach: f64,
+    /// The surface that it leaves: never met again at the start.
+    pub(crate) leaving: Surface,
+}
+
+/// A surface, for leaving it: all faces in exactly one plane, all equal spheres, or else one face.
+/// (A ray that starts in a plane never meets that plane again.)
+#[derive(Debug, Clone, Copy, PartialEq, Eq, bytemuck::Pod, bytemuck::Zeroable)]
+#[repr(transparent)]
+pub(crate) struct Surface(pub(crate) u32);
+
+impl Surface {
+    /// A ray that starts in free space.
+    pub(crate) const NONE: Self = Self(u32::MAX);
+}
+
+/// The nearest face along a ray: the smallest (t, rank).
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Hit {
+    /// The distance in units of the ray's direction; infinite where nothing is hit.
+    pub(crate) t: f64,
+    /// The face's place among all faces of the scene.
+    pub(crate) rank: u32,
+    /// Which face.
+    pub(crate) item: Item,
+}
+
+impl Hit {
+    /// Nothing, up to `reach`.
+    pub(crate) fn none(reach: f64) -> Self {
+        Self { t: reach, rank: u32::MAX, item: Item::NONE }
+    }
+
+    /// Whether a face is hit.
+    pub(crate) fn is_some(&self) -> bool {
+        self.item != Item::NONE
+    }
+}
+
+/// A face in the prepared scene: its kind in the upper 3 bits, its index among its kind below.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, bytemuck::Pod, bytemuck::Zeroable)]
+#[repr(transparent)]
+pub(crate) struct Item(u32);
+
+/// The kinds of faces.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Kind {
+    /// A triangle alone in its plane.
+    Triangle = 0,
+    /// A triangle that shares its plane with other faces.
+    Coplanar = 1,
+    /// A quadrangle.
+    Quadrangle = 2,
+    /// A sphere.
+    Sphere = 3,
+}
+
+impl Item {
+    /// No face.
+    pub(crate) const NONE: Self = Self(u32::MAX);
+    /// How many faces of one kind a scene may have.
+    pub(crate) const LIMIT: usize = 1 << 29;
+
+    /// A face of the given kind.
+    pub(crate) fn new(kind: Kind, index: usize) -> Self {
+        debug_assert!(index < Self::LIMIT);
+        Self((kind as u32) << 29 | index as u32)
+    }
+
+    /// The kind; `None` for bits that no kind has.
+    #[inline(always)]
+    pub(crate) fn kind(self) -> Option<Kind> {
+        match self.0 >> 29 {
+            0 => Some(Kind::Triangle),
+            1 => Some(Kind::Coplanar),
+            2 => Some(Kind::Quadrangle),
+            3 => Some(Kind::Sphere),
+            _ => None,
+        }
+    }
+
+    /// The index among the faces of its kind.
+    #[inline(always)]
+    pub(crate) fn index(self) -> usize {
+        (self.0 & (Self::LIMIT as u32 - 1)) as usize
+    }
+}
+
+/// A ray ready to meet flat faces: seen along its own direction, it is the point (0, 0).
+///
+/// Source: Woop, Benthin & Wald, "Watertight Ray/Triangle Intersection" (2013): the direction's
+/// largest component becomes the depth axis and the other two are sheared along it.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Shear {
+    axes: [usize; 3],
+    origin: [f64; 3],
+    slopes: [f64; 3],
+}
+
+/// A vertex as a ray sees it.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Projected {
+    pub(crate) x: f64,
+    pub(crate) y: f64,
+    /// The distance along the ray, in units of its direction.
+    pub(crate) z: f64,
+}
+
+impl Shear {
+    #[inline(always)]
+    pub(crate) fn new(origin: DVec3, direction: DVec3) -> Self {
+        let d = direction.to_array();
+        let size = d.map(f64::abs);
+        let z = if size[0] > size[1] {
+            if size[0] > size[2] { 0 } else { 2 }
+        } else if size[1] > size[2] {
+            1
+        } else {
+            2
+        };
+        let (x, y) = ((z + 1) % 3, (z + 2) % 3);
+        let o = origin.to_array();
+        Self {
+            axes: [x, y, z],
+            origin: [o[x], o[y], o[z]],
+            slopes: [d[x] / d[z], d[y] / d[z], 1.0 / d[z]],
+        }
+    }
+
+    /// The same for one vertex whoever asks, so that faces that share it agree on it.
+    #[inline(always)]
+    pub(crate) fn project(&self, vertex: &[f64; 3]) -> Projected {
+        let [x, y, z] = self.axes;
+        let depth = vertex[z] - self.origin[2];
+        Projected {
+            x: (vertex[x] - self.origin[0]) - self.slopes[0] * depth,
+            y: (vertex[y] - self.origin[1]) - self.slopes[1] * depth,
+            z: self.slopes[2] * depth,
+        }
+    }
+}
+
+/// On which side of the directed edge from `a` to `b` the ray passes: twice the signed area of
+/// (ray, a, b) as the rays sees it, rounded.
+///
+/// Its sign is exact unless it is 0: rounding keeps order, so a rounded product can only be larger
+/// than another if the exact one is. Swapping `a` and `b` flips the sign and nothing else, so
+/// faces that share an edge never both let a ray through or both stop it.
+#[inline(always)]
+pub(crate) fn edge(a: &Projected, b: &Projected) -> f64 {
+    a.x * b.y - a.y * b.x
+}
+
+/// [`edge`] with the digits that the products lost: right to an ulp or two.
+pub(crate) fn exact_edge(a: &Projected, b: &Projected) -> f64 {
+    let (left, left_error) = exact_product(a.x, b.y);
+    let (right, right_error) = exact_product(a.y, b.x);
+    (left - right) + (left_error - right_error)
+}
+
+/// The side on which a ray passes that is nudged off every edge: by ε² along x and by the much
+/// larger ε along y, for an ε smaller than any number. So a ray that meets an edge or a vertex
+/// belongs to exactly one of the faces around it, and a face seen edge-on is never met.
+/// -1, 0 or 1; 0 only where `a` and `b` coincide on the screen.
+///
+/// Source: Edelsbrunner & Mücke, "Simulation of Simplicity" (1990).
+#[cold]
+pub(crate) fn side(a: &Projected, b: &Projected) -> i32 {
+    let (left, left_error) = exact_product(a.x, b.y);
+    let (right, right_error) = exact_product(a.y, b.x);
+    // Equal products differ by what they lost; after that the nudge decides.
+    [left - right, left_error - right_error, b.x - a.x, a.y - b.y]
+        .into_iter()
+        .find(|&difference| difference != 0.0)
+        .map_or(0, |difference| if difference > 0.0 { 1 } else { -1 })
+}
+
+/// a · b as the rounded product and what rounding took away, exact while neither overflows nor
+/// underflows. Source: Dekker, "A floating-point technique for extending the available precision"
+/// (1971), with Veltkamp's splitting.
+pub(crate) fn exact_product(a: f64, b: f64) -> (f64, f64) {
+    let product = a * b;
+    let (a_high, a_low) = split(a);
+    let (b_high, b_low) = split(b);
+    let error = a_low * b_low - (((product - a_high * b_high) - a_low * b_high) - a_high * b_low);
+    (product, error)
+}
+
+fn split(a: f64) -> (f64, f64) {
+    const SPLITTER: f64 = 134_217_729.0; // 2^27 + 1
+    let c = SPLITTER * a;
+    let high = c - (c - a);
+    (high, a - high)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn at(x: f64, y: f64) -> Projected {
+        Projected { x, y, z: 1.0 }
+    }
+
+    #[test]
+    fn an_edge_that_rounds_to_zero_still_has_a_side() {
+        // (1 + u)(1 - u) = 1 - u², which rounds to 1.
+        let u = f64::EPSILON;
+        let (a, b) = (at(1.0 + u, 1.0), at(1.0, 1.0 - u));
+        assert_eq!(edge(&a, &b), 0.0);
+        assert!(exact_edge(&a, &b) < 0.0);
+        assert_eq!(side(&a, &b), -side(&b, &a));
+    }
+
+    #[test]
+    fn a_ray_at_a_vertex_belongs_to_one_triangle_of_a_fan() {
+        let middle = at(0.0, 0.0);
+        let rim = [at(1.0, 0.0), at(0.3, 2.0), at(-1.0, 0.5), at(-1.0, -1.0), at(0.0, -2.0)];
+        let inside = (0..rim.len())
+            .filter(|&k| {
+                let (a, b) = (rim[k], rim[(k + 1) % rim.len()]);
+                side(&middle, &a) == side(&a, &b) && side(&a, &b) == side(&b, &middle)
+            })
+            .count();
+        assert_eq!(inside, 1);
+    }
+}

@@ -1,0 +1,258 @@
+//! The tracer against the oracle, against brute force and against itself on other instructions.
+
+use glam::DVec3;
+use rtfarm_core::{
+    isa::Isa,
+    prepared::{PreparedBytes, PreparedScene, prepare},
+    scene::Scene,
+    trace::{Probe, ProbeHit},
+};
+use rtfarm_oracle::{
+    FaceId, Leaving, Oracle,
+    random::Random,
+    random_scene::{Aim, Recipe, Style, random_ray, random_scene},
+};
+
+/// Where the true answer changes within this distance (in units of the greatest coordinate that
+/// takes part) either answer is right: a few roundings of f64.
+const CLOSE: f64 = 256.0 * f64::EPSILON;
+
+/// A quadrangle's corners are in one plane only within rounding. The oracle looks at it along its
+/// normal, the tracer along the ray: for one that is grazed that makes a difference.
+const CLOSE_QUADRANGLE: f64 = 1e-9;
+
+const STYLES: [Style; 4] = [Style::Plain, Style::Grid, Style::Extreme, Style::Far];
+
+fn opened(scene: &Scene) -> PreparedScene<PreparedBytes> {
+    PreparedScene::open(prepare(scene).expect("a plain scene")).expect("a valid block")
+}
+
+fn flat_recipe(style: Style) -> Recipe {
+    Recipe { parallelepipeds: 0, ..Recipe::new(style) }
+}
+
+fn rays(scene: &Scene, seed: u64, count: usize) -> Vec<Probe> {
+    let mut random = Random::new(seed);
+    (0..count)
+        .map(|k| {
+            let aim = Aim::ALL[k % Aim::ALL.len()];
+            let (origin, direction) = random_ray(scene, aim, &mut random);
+            Probe { origin, direction: direction.normalize(), leaving: None }
+        })
+        .collect()
+}
+
+/// The same answer, or one that is right within the roundings of f64.
+fn check_against_oracle(
+    (scene, oracle): (&Scene, &Oracle),
+    probe: &Probe,
+    found: Option<ProbeHit>,
+    what: &str,
+) -> bool {
+    let leaving = probe
+        .leaving
+        .map(|primitive| Leaving { id: FaceId { primitive, face: 0 }, through: false });
+    let truth = oracle.first_hit(probe.origin, probe.direction, leaving);
+    if truth.map(|hit| hit.id.primitive) != found.map(|hit| hit.primitive) {
+        let margin = oracle.miss_margin(probe.origin, probe.direction, leaving);
+        let involved = [truth.map(|hit| hit.id.primitive), found.map(|hit| hit.primitive)];
+        let is_quadrangle = scene.quadrangles.iter().any(|q| involved.contains(&Some(q.primitive)));
+        let close = if is_quadrangle { CLOSE_QUADRANGLE } else { CLOSE };
+        assert!(margin < close, "{what}: {probe:?}: {found:?} but truly {truth:?}");
+        return false;
+    }
+    if let (Some(hit), Some(found)) = (truth, found) {
+        // Across the face; along the ray it grows as the ray grazes.
+        let error = (hit.t - found.t).abs() * hit.normal.dot(probe.direction).abs();
+        let extent = oracle_extent(scene, found.primitive);
+        let scale = probe.origin.abs().max_element().max(hit.point.abs().max_element()).max(extent);
+        let bound = CLOSE * scale;
+        assert!(
+            error <= bound,
+            "{what}: {probe:?}: t {} but truly {hit:?}, scale {scale}",
+            found.t
+        );
+    }
+    true
+}
+
+/// The greatest coordinate of a face.
+fn oracle_extent(scene: &Scene, primitive: u32) -> f64 {
+    let corners = (scene.triangles.iter())
+        .filter(|face| face.primitive == primitive)
+        .flat_map(|face| face.vertices)
+        .chain(
+            (scene.quadrangles.iter())
+                .filter(|face| face.primitive == primitive)
+                .flat_map(|face| face.vertices),
+        );
+    let spheres = (scene.spheres.iter())
+        .filter(|sphere| sphere.primitive == primitive)
+        .map(|sphere| sphere.center.abs() + sphere.radius);
+    corners.chain(spheres).map(|corner| corner.abs().max_element()).fold(0.0, f64::max)
+}
+
+#[test]
+fn the_tracer_meets_what_the_oracle_meets() {
+    for style in STYLES {
+        let (mut same, mut close) = (0, 0);
+        for seed in 0..60 {
+            let scene = random_scene(seed, &flat_recipe(style));
+            let (prepared, oracle) = (opened(&scene), Oracle::new(&scene));
+            let probes = rays(&scene, seed, 100);
+            for (probe, found) in probes.iter().zip(prepared.probe(&probes, Isa::fastest())) {
+                let what = format!("{style:?} scene {seed}");
+                if check_against_oracle((&scene, &oracle), probe, found, &what) {
+                    same += 1;
+                } else {
+                    close += 1;
+                }
+            }
+        }
+        eprintln!("{style:?}: {same} answers are the oracle's, {close} too close to call");
+    }
+}
+
+#[test]
+fn a_ray_that_leaves_a_face_meets_what_the_oracle_meets() {
+    for style in STYLES {
+        for seed in 0..40 {
+            let scene = random_scene(seed, &flat_recipe(style));
+            let (prepared, oracle) = (opened(&scene), Oracle::new(&scene));
+            let first = rays(&scene, seed, 60);
+            let mut random = Random::new(seed);
+            let mut secondary = Vec::new();
+            for (probe, hit) in first.iter().zip(prepared.probe(&first, Isa::fastest())) {
+                let Some(hit) = hit else { continue };
+                let origin = probe.origin + hit.t * probe.direction;
+                let direction = random.direction();
+                secondary.push(Probe { origin, direction, leaving: Some(hit.primitive) });
+            }
+            let found = prepared.probe(&secondary, Isa::fastest());
+            for (probe, found) in secondary.iter().zip(found) {
+                let what = format!("{style:?} scene {seed}, leaving");
+                check_against_oracle((&scene, &oracle), probe, found, &what);
+            }
+        }
+    }
+}
+
+#[test]
+fn the_hierarchy_finds_what_brute_force_finds_on_every_instruction_set() {
+    for style in STYLES {
+        for seed in 0..30 {
+            let recipe =
+                Recipe { spheres: 60, triangles: 120, quadrangles: 60, ..flat_recipe(style) };
+            let scene = random_scene(seed, &recipe);
+            let prepared = opened(&scene);
+            let probes = rays(&scene, seed, 500);
+            let brute = prepared.probe_all_faces(&probes);
+            for isa in Isa::ALL.into_iter().filter(|isa| isa.is_supported()) {
+                let found = prepared.probe(&probes, isa);
+                for ((probe, brute), found) in probes.iter().zip(&brute).zip(found) {
+                    let bits = |hit: &ProbeHit| (hit.primitive, hit.t.to_bits());
+                    assert_eq!(
+                        found.as_ref().map(bits),
+                        brute.as_ref().map(bits),
+                        "{style:?} scene {seed}, {isa}: {probe:?}"
+                    );
+                }
+            }
+        }
+    }
+}
+
+/// A closed surface of `around` x `along` patches: alternately two triangles and one quadrangle.
+fn closed_surface(around: usize, along: usize, offset: DVec3, scale: f64) -> Scene {
+    let mut scene = random_scene(0, &Recipe { lights: 0, ..flat_recipe(Style::Plain) });
+    (scene.spheres, scene.triangles, scene.quadrangles) = (vec![], vec![], vec![]);
+    let torus = |i: usize, j: usize| {
+        let turn = |k: usize, of: usize| {
+            // A rational point of the circle: no sine needed.
+            let t = (k % of) as f64 / of as f64 * 8.0 - 4.0;
+            let t = if t.abs() < 1.0 { t } else { t * t * t.signum() };
+            ((1.0 - t * t) / (1.0 + t * t), 2.0 * t / (1.0 + t * t))
+        };
+        let ((c, s), (d, e)) = (turn(i, around), turn(j, along));
+        DVec3::new((2.0 + 0.7 * d) * c, 0.7 * e, (2.0 + 0.7 * d) * s) * scale + offset
+    };
+    for j in 0..along {
+        for i in 0..around {
+            let [a, b, c, d] = [torus(i, j), torus(i + 1, j), torus(i + 1, j + 1), torus(i, j + 1)];
+            let primitive = (scene.triangles.len() + scene.quadrangles.len()) as u32;
+            for (k, vertices) in [[a, b, c], [a, c, d]].into_iter().enumerate() {
+                let primitive = primitive + k as u32;
+                let triangle = rtfarm_core::scene::Triangle { vertices, material: 0, primitive };
+                scene.triangles.push(triangle);
+            }
+        }
+    }
+    scene
+}
+
+#[test]
+fn a_closed_surface_is_crossed_an_even_number_of_times_at_edges_and_corners_too() {
+    for (offset, scale) in [
+        (0.0, 1.0),
+        (1e3, 1.0),
+        (1e6, 1.0),
+        (1e9, 1.0),
+        (0.0, 2_f64.powi(40)),
+        (0.0, 2_f64.powi(-40)),
+    ] {
+        let scene = closed_surface(40, 20, DVec3::splat(offset), scale);
+        let prepared = opened(&scene);
+        let mut random = Random::new(1);
+        let probes: Vec<Probe> = (0..20_000)
+            .map(|k| {
+                let corners = scene.triangles[random.below(scene.triangles.len())].vertices;
+                let target = match k % 3 {
+                    0 => corners[0],
+                    1 => (corners[0] + corners[1]) / 2.0,
+                    _ => corners[1] + (corners[2] - corners[1]) * random.unit(),
+                };
+                let origin = DVec3::splat(offset) + 5.0 * scale * random.direction();
+                Probe { origin, direction: (target - origin).normalize(), leaving: None }
+            })
+            .collect();
+        let leaks = prepared.count_crossings(&probes).iter().filter(|&n| n % 2 == 1).count();
+        assert_eq!(leaks, 0, "moved by {offset}, scaled by {scale}");
+    }
+}
+
+#[test]
+fn a_scaled_scene_gives_the_same_hits_to_the_bit() {
+    let scene = random_scene(3, &flat_recipe(Style::Plain));
+    let probes = rays(&scene, 3, 1000);
+    let hits = opened(&scene).probe(&probes, Isa::fastest());
+    for exponent in [-40, 40] {
+        let factor = 2_f64.powi(exponent);
+        let mut scaled = scene.clone();
+        for sphere in &mut scaled.spheres {
+            sphere.center *= factor;
+            sphere.radius *= factor;
+        }
+        scaled
+            .triangles
+            .iter_mut()
+            .for_each(|face| face.vertices = face.vertices.map(|v| v * factor));
+        scaled
+            .quadrangles
+            .iter_mut()
+            .for_each(|face| face.vertices = face.vertices.map(|v| v * factor));
+        scaled.lights.iter_mut().for_each(|light| light.position *= factor);
+        let viewport = scaled.viewport.as_mut().expect("a viewport");
+        viewport.eye *= factor;
+        viewport.top_left *= factor;
+        viewport.top_right *= factor;
+        viewport.bottom_left *= factor;
+        let probes: Vec<Probe> =
+            probes.iter().map(|probe| Probe { origin: probe.origin * factor, ..*probe }).collect();
+        for (hit, scaled) in hits.iter().zip(opened(&scaled).probe(&probes, Isa::fastest())) {
+            assert_eq!(
+                hit.map(|h| (h.primitive, h.t * factor)),
+                scaled.map(|h| (h.primitive, h.t))
+            );
+        }
+    }
+}

@@ -1,0 +1,81 @@
+//! Where a coordinator is found.
+
+use std::{fmt, path::PathBuf, str::FromStr, time::Duration};
+
+use tonic::transport::{Channel, Endpoint};
+
+/// Where a coordinator is found.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Address {
+    /// A socket on this machine.
+    Unix(PathBuf),
+    /// `host:port`, by TCP.
+    Tcp(String),
+}
+
+/// A text that is no address of a coordinator.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("`{0}` is no coordinator's address; one looks like http://host:7878 or unix:/path/socket")]
+pub struct AddressError(String);
+
+impl FromStr for Address {
+    type Err = AddressError;
+
+    fn from_str(text: &str) -> Result<Self, AddressError> {
+        let error = || AddressError(text.to_owned());
+        if let Some(path) = text.strip_prefix("unix:") {
+            let path = path.strip_prefix("//").unwrap_or(path);
+            return if path.is_empty() { Err(error()) } else { Ok(Self::Unix(path.into())) };
+        }
+        let host = text.strip_prefix("http://").ok_or_else(error)?;
+        let host = host.strip_suffix('/').unwrap_or(host);
+        let (name, port) = host.rsplit_once(':').ok_or_else(error)?;
+        let is_host = !name.is_empty() && port.parse::<u16>().is_ok();
+        Endpoint::from_shared(format!("http://{host}")).map_err(|_| error())?;
+        if is_host { Ok(Self::Tcp(host.to_owned())) } else { Err(error()) }
+    }
+}
+
+impl fmt::Display for Address {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Unix(path) => write!(f, "unix:{}", path.display()),
+            Self::Tcp(host) => write!(f, "http://{host}"),
+        }
+    }
+}
+
+impl Address {
+    /// Connects; a channel that was connected once connects again by itself.
+    pub async fn connect(&self) -> Result<Channel, tonic::transport::Error> {
+        const WINDOW_BYTES: u32 = 1 << 22;
+        Endpoint::from_shared(self.to_string())?
+            .connect_timeout(Duration::from_secs(5))
+            .initial_stream_window_size(WINDOW_BYTES)
+            .initial_connection_window_size(WINDOW_BYTES)
+            .http2_keep_alive_interval(Duration::from_secs(10))
+            .keep_alive_timeout(Duration::from_secs(20))
+            .connect()
+            .await
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn addresses_are_read_as_they_are_written() {
+        for text in ["http://127.0.0.1:7878", "http://host:1", "http://[::1]:80", "unix:/a/b c"] {
+            assert_eq!(text.parse::<Address>().unwrap().to_string(), text);
+        }
+        assert_eq!("unix:///a".parse(), Ok(Address::Unix("/a".into())));
+    }
+
+    #[test]
+    fn what_is_no_address_is_refused() {
+        for text in ["", "host", "host:80", "http://host", "http://:80", "http://a b:80", "unix:"] {
+            text.parse::<Address>().expect_err(text);
+        }
+    }
+}

@@ -1,0 +1,290 @@
+//! The command line's words.
+
+use std::{fmt, path::PathBuf, str::FromStr, time::Duration};
+
+use clap::{Args as ClapArgs, Parser, Subcommand, ValueEnum, value_parser};
+use rtfarm_coordinator::Wish;
+use rtfarm_core::{
+    isa::{Isa, IsaError},
+    picture::PictureFormat,
+    tile::{Size, SizeError, TileGrid},
+};
+use rtfarm_proto::Address;
+
+use crate::output::Output;
+
+/// Renders scenes in the rt language, on one machine or many.
+#[derive(Debug, Parser)]
+#[command(version, propagate_version = true)]
+pub(crate) struct Args {
+    #[command(subcommand)]
+    pub(crate) command: Command,
+}
+
+#[derive(Debug, Subcommand)]
+pub(crate) enum Command {
+    /// Render a scene on this machine.
+    Render(RenderArgs),
+    /// Run a farm's coordinator until it is stopped.
+    Coordinator(CoordinatorArgs),
+    /// Work for a coordinator until it sends the worker home.
+    Worker(WorkerArgs),
+    /// Have a farm render a scene.
+    Submit(SubmitArgs),
+}
+
+/// What picture is wanted.
+#[derive(Debug, ClapArgs)]
+pub(crate) struct PictureArgs {
+    /// The scene's file; `-` reads it from standard input.
+    pub(crate) scene: PathBuf,
+
+    /// Where the picture goes; the extension, .png or .exr, says how it is written.
+    #[arg(short, long = "output", value_name = "FILE")]
+    output: PathBuf,
+
+    /// The picture's size in pixels; the scene's own wish by default.
+    #[arg(long, value_name = "WxH", value_parser = parse_size)]
+    size: Option<Size>,
+
+    /// Samples in every pixel.
+    #[arg(long, value_name = "N", default_value_t = 16, value_parser = value_parser!(u32).range(1..=65_536))]
+    samples: u32,
+
+    /// Chooses the random numbers.
+    #[arg(long, value_name = "N", default_value_t = 0)]
+    seed: u64,
+
+    /// Show every surface in its plain colour, as in a scene without light.
+    #[arg(long)]
+    flat: bool,
+
+    /// The side of a tile in pixels; by default the one that gives about 1000 tiles.
+    #[arg(long, value_name = "N", value_parser = value_parser!(u64).range(TileGrid::SIDES))]
+    tile: Option<u64>,
+
+    /// Bits a channel of a PNG.
+    #[arg(long, value_name = "BITS", value_parser = ["8", "16"])]
+    depth: Option<String>,
+}
+
+#[derive(Debug, ClapArgs)]
+pub(crate) struct RenderArgs {
+    #[command(flatten)]
+    pub(crate) picture: PictureArgs,
+
+    /// Worker processes; 0 renders in this one. Default: 2, or 1 on a single core.
+    #[arg(long, value_name = "N", value_parser = value_parser!(u16).range(0..=256))]
+    workers: Option<u16>,
+
+    /// Threads of each worker; by default the cores are shared out.
+    #[arg(long, value_name = "N", value_parser = value_parser!(u16).range(1..=1024))]
+    threads: Option<u16>,
+
+    /// The instruction set that the kernels use; all give the same bytes.
+    #[arg(long, value_name = "auto|scalar|sse2|avx2", default_value = "auto")]
+    pub(crate) isa: IsaChoice,
+
+    /// A worker that makes no progress for this long loses its tiles to others.
+    #[arg(long, value_name = "S", default_value = "4", value_parser = parse_seconds)]
+    pub(crate) lease_seconds: Duration,
+
+    /// How log lines are written.
+    #[arg(long, value_name = "FORMAT", default_value = "text")]
+    pub(crate) log_format: LogFormat,
+}
+
+#[derive(Debug, ClapArgs)]
+pub(crate) struct CoordinatorArgs {
+    /// The address and port to listen on; port 0 takes a free one.
+    #[arg(long, value_name = "ADDR:PORT", default_value = "127.0.0.1:7878")]
+    pub(crate) listen: String,
+
+    /// Listen to other machines though nothing is encrypted and nobody is asked for a token.
+    #[arg(long)]
+    pub(crate) insecure: bool,
+
+    /// The folder for scenes and pictures under way; the system's folder for temporary files by
+    /// default.
+    #[arg(long, value_name = "FOLDER")]
+    pub(crate) state: Option<PathBuf>,
+
+    /// A worker that makes no progress for this long loses its tiles to others.
+    #[arg(long, value_name = "S", default_value = "4", value_parser = parse_seconds)]
+    pub(crate) lease_seconds: Duration,
+
+    /// How log lines are written.
+    #[arg(long, value_name = "FORMAT", default_value = "text")]
+    pub(crate) log_format: LogFormat,
+}
+
+#[derive(Debug, ClapArgs)]
+pub(crate) struct WorkerArgs {
+    /// Where the coordinator is: `http://host:7878` or `unix:/path/socket`.
+    #[arg(long, value_name = "URL")]
+    pub(crate) coordinator: Address,
+
+    /// Threads; all cores by default.
+    #[arg(long, value_name = "N", value_parser = value_parser!(u16).range(1..=1024))]
+    threads: Option<u16>,
+
+    /// The instruction set that the kernels use; all give the same bytes.
+    #[arg(long, value_name = "auto|scalar|sse2|avx2", default_value = "auto")]
+    pub(crate) isa: IsaChoice,
+
+    /// How long to go on without a coordinator.
+    #[arg(long, value_name = "S", default_value = "60", value_parser = parse_seconds)]
+    pub(crate) patience: Duration,
+
+    /// How log lines are written.
+    #[arg(long, value_name = "FORMAT", default_value = "text")]
+    pub(crate) log_format: LogFormat,
+
+    /// Live no longer than this process, which has started this one.
+    #[arg(long, hide = true)]
+    pub(crate) parent: Option<u32>,
+
+    /// Say to be of this version.
+    #[arg(long, hide = true, default_value = crate::VERSION)]
+    pub(crate) claim_version: String,
+}
+
+#[derive(Debug, ClapArgs)]
+pub(crate) struct SubmitArgs {
+    #[command(flatten)]
+    pub(crate) picture: PictureArgs,
+
+    /// Where the coordinator is: `http://host:7878` or `unix:/path/socket`.
+    #[arg(long, value_name = "URL")]
+    pub(crate) coordinator: Address,
+
+    /// How log lines are written.
+    #[arg(long, value_name = "FORMAT", default_value = "text")]
+    pub(crate) log_format: LogFormat,
+}
+
+/// How log lines are written.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub(crate) enum LogFormat {
+    /// For people and `grep`.
+    Text,
+    /// One object a line.
+    Json,
+}
+
+impl fmt::Display for LogFormat {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::Text => "text",
+            Self::Json => "json",
+        })
+    }
+}
+
+/// An instruction set, chosen by name or as the fastest there is.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct IsaChoice(pub(crate) Isa);
+
+impl FromStr for IsaChoice {
+    type Err = IsaError;
+
+    fn from_str(name: &str) -> Result<Self, IsaError> {
+        if name == "auto" { Ok(Self(Isa::fastest())) } else { name.parse().map(Self) }
+    }
+}
+
+impl PictureArgs {
+    /// Where the picture goes and how it is written.
+    pub(crate) fn output(&self) -> anyhow::Result<Output> {
+        Output::new(&self.output, self.depth.as_deref())
+    }
+
+    /// What is wanted of the scene.
+    pub(crate) fn wish(&self, format: PictureFormat) -> Wish {
+        Wish {
+            name: self.scene_name(),
+            size: self.size,
+            samples: self.samples,
+            seed: self.seed,
+            flat: self.flat,
+            tile_side: self.tile,
+            format,
+        }
+    }
+
+    /// The scene as messages call it.
+    pub(crate) fn scene_name(&self) -> String {
+        if self.is_from_stdin() { "<stdin>".to_owned() } else { self.scene.display().to_string() }
+    }
+
+    pub(crate) fn is_from_stdin(&self) -> bool {
+        self.scene.as_os_str() == "-"
+    }
+}
+
+impl RenderArgs {
+    /// Worker processes, and threads of each.
+    pub(crate) fn workers_and_threads(&self) -> (usize, usize) {
+        let cores = core_count();
+        let workers = self.workers.map_or(cores.min(2), usize::from);
+        let threads = self.threads.map_or((cores / workers.max(1)).max(1), usize::from);
+        (workers, threads)
+    }
+}
+
+impl WorkerArgs {
+    /// Threads that render.
+    pub(crate) fn threads(&self) -> usize {
+        self.threads.map_or_else(core_count, usize::from)
+    }
+}
+
+impl Command {
+    /// How log lines are written.
+    pub(crate) fn log_format(&self) -> LogFormat {
+        match self {
+            Self::Render(args) => args.log_format,
+            Self::Coordinator(args) => args.log_format,
+            Self::Worker(args) => args.log_format,
+            Self::Submit(args) => args.log_format,
+        }
+    }
+}
+
+fn core_count() -> usize {
+    std::thread::available_parallelism().map_or(1, usize::from)
+}
+
+fn parse_size(text: &str) -> Result<Size, String> {
+    let sides = text.split_once('x').and_then(|(w, h)| Some((w.parse().ok()?, h.parse().ok()?)));
+    let (width, height) = sides.ok_or("a size looks like 1280x720")?;
+    Size::new(width, height).map_err(|error: SizeError| error.to_string())
+}
+
+fn parse_seconds(text: &str) -> Result<Duration, String> {
+    let seconds: f64 = text.parse().map_err(|_| "a number of seconds is wanted")?;
+    if (0.1..=86_400.0).contains(&seconds) {
+        Ok(Duration::from_secs_f64(seconds))
+    } else {
+        Err("a time is from 0.1 to 86400 seconds".to_owned())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_words_fit_together() {
+        use clap::CommandFactory;
+        Args::command().debug_assert();
+    }
+
+    #[test]
+    fn sizes_are_read_and_checked() {
+        assert_eq!(parse_size("1280x720"), Ok(Size::new(1280, 720).unwrap()));
+        for bad in ["", "x", "1280", "0x0", "100000x100000", "-1x5", "1x1x1", "1.5x2"] {
+            parse_size(bad).expect_err(bad);
+        }
+    }
+}

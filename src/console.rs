@@ -1,0 +1,162 @@
+//! Standard error: log lines and the progress bar, which share it.
+
+use std::{
+    io::{self, IsTerminal, Write},
+    sync::{Arc, Mutex},
+    time::Duration,
+};
+
+use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+use rtfarm_coordinator::Progress;
+use rtfarm_core::read::Style;
+use tokio::time::Instant;
+use tracing_subscriber::{EnvFilter, fmt::MakeWriter};
+
+use crate::args::{Command, LogFormat};
+
+/// Standard error. Clones are the same one.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct Console {
+    /// Set while a bar is on the screen; lines are then written above it.
+    bar: Arc<Mutex<Option<ProgressBar>>>,
+    wants_bar: bool,
+}
+
+impl Console {
+    /// Standard error without logs and bars.
+    pub(crate) fn plain() -> Self {
+        Self::default()
+    }
+
+    /// Standard error as a command uses it: with a bar on a terminal, with log lines elsewhere.
+    /// `RUST_LOG` chooses others.
+    pub(crate) fn new(command: &Command) -> Self {
+        let format = command.log_format();
+        let has_bar = matches!(command, Command::Render(_) | Command::Submit(_))
+            && format == LogFormat::Text
+            && io::stderr().is_terminal();
+        let is_local_worker = matches!(command, Command::Worker(args) if args.parent.is_some());
+        let level = if has_bar || is_local_worker { "warn" } else { "info" };
+        let console = Self { wants_bar: has_bar, ..Self::default() };
+        let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new(level));
+        let lines = tracing_subscriber::fmt()
+            .with_env_filter(filter)
+            .with_target(false)
+            .with_writer(console.clone());
+        match format {
+            LogFormat::Text => lines.init(),
+            LogFormat::Json => lines.json().flatten_event(true).init(),
+        }
+        console
+    }
+
+    /// Writes a line.
+    pub(crate) fn tell(&self, line: &str) {
+        let _ = writeln!(self.make_writer(), "{line}");
+    }
+
+    /// Writes what there is to say about a scene, unless that is nothing.
+    pub(crate) fn tell_report(&self, report: &str) {
+        if !report.is_empty() {
+            self.tell(report.trim_end());
+        }
+    }
+
+    /// How diagnostics are drawn: in colours on a terminal, unless `NO_COLOR` is set.
+    pub(crate) fn drawing_style() -> Style {
+        let is_plain = std::env::var_os("NO_COLOR").is_some_and(|value| !value.is_empty());
+        if io::stderr().is_terminal() && !is_plain { Style::Colored } else { Style::Plain }
+    }
+
+    /// Shows a bar for a picture of so many tiles, if bars are shown at all.
+    pub(crate) fn start_bar(&self, tile_count: u32) -> Bar {
+        let bar = self.wants_bar.then(|| {
+            let style = ProgressStyle::with_template("{bar:40} {pos}/{len} tiles  {msg}");
+            let bar = ProgressBar::with_draw_target(
+                Some(tile_count.into()),
+                ProgressDrawTarget::stderr_with_hz(10),
+            )
+            .with_style(style.unwrap_or_else(|_| ProgressStyle::default_bar()));
+            bar.enable_steady_tick(Duration::from_millis(200));
+            *self.lock() = Some(bar.clone());
+            bar
+        });
+        Bar { drawn: bar, console: self.clone(), start: Instant::now() }
+    }
+
+    fn lock(&self) -> std::sync::MutexGuard<'_, Option<ProgressBar>> {
+        self.bar.lock().expect("drawing never panics")
+    }
+}
+
+/// A progress bar; it goes when this does.
+#[derive(Debug)]
+pub(crate) struct Bar {
+    drawn: Option<ProgressBar>,
+    console: Console,
+    start: Instant,
+}
+
+impl Bar {
+    /// Draws how far a job is.
+    pub(crate) fn show(&self, progress: &Progress) {
+        let Some(bar) = &self.drawn else { return };
+        bar.set_position(progress.tiles_done.into());
+        if progress.tiles_done > 0 {
+            let seconds = self.start.elapsed().as_secs_f64();
+            let tiles_left = f64::from(progress.tile_count - progress.tiles_done);
+            let left = seconds / f64::from(progress.tiles_done) * tiles_left;
+            let mrays = progress.rays as f64 / 1e6 / seconds;
+            bar.set_message(format!("{mrays:.1} Mrays/s  {left:.0} s left"));
+        }
+    }
+}
+
+impl Drop for Bar {
+    fn drop(&mut self) {
+        if let Some(bar) = &self.drawn {
+            bar.finish_and_clear();
+            *self.console.lock() = None;
+        }
+    }
+}
+
+impl<'a> MakeWriter<'a> for Console {
+    type Writer = LineWriter;
+
+    fn make_writer(&'a self) -> LineWriter {
+        LineWriter { console: self.clone(), line: Vec::new() }
+    }
+}
+
+/// Collects a line and writes it in one piece, so that lines of several processes do not mix.
+#[derive(Debug)]
+pub(crate) struct LineWriter {
+    console: Console,
+    line: Vec<u8>,
+}
+
+impl Write for LineWriter {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        self.line.extend_from_slice(bytes);
+        Ok(bytes.len())
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        Ok(())
+    }
+}
+
+impl Drop for LineWriter {
+    fn drop(&mut self) {
+        // There is nobody to tell when standard error fails.
+        let write = || {
+            let _ = io::stderr().write_all(&self.line);
+        };
+        let bar = self.console.lock().clone();
+        match bar {
+            Some(bar) => bar.suspend(write),
+            None => write(),
+        }
+    }
+}

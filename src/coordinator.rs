@@ -1,0 +1,41 @@
+//! `rtfarm coordinator`: a farm that stays up.
+
+use std::{
+    env,
+    io::{self, Write},
+};
+
+use anyhow::{Context, anyhow};
+use rtfarm_coordinator::{Config, Coordinator, Listener};
+use tokio::net::{TcpListener, lookup_host};
+use tokio_util::sync::CancellationToken;
+
+use crate::{VERSION, args::CoordinatorArgs, failure::Failure, render::private_folder};
+
+pub(crate) async fn run(args: CoordinatorArgs, stop: &CancellationToken) -> Result<(), Failure> {
+    let listen = &args.listen;
+    let mut addresses = lookup_host(listen).await.map_err(|error| {
+        Failure::Input(anyhow!("`{listen}` is no address to listen on: {error}"))
+    })?;
+    let address = addresses.next().with_context(|| format!("`{listen}` has no address"))?;
+    if !address.ip().is_loopback() && !args.insecure {
+        return Err(Failure::Input(anyhow!(
+            "{address} is open to other machines, and TLS and tokens are still to come; \
+             --insecure listens there all the same"
+        )));
+    }
+    let folder = private_folder(&args.state.unwrap_or_else(env::temp_dir))?;
+    let listener =
+        TcpListener::bind(address).await.with_context(|| format!("cannot listen on {address}"))?;
+    writeln!(io::stdout().lock(), "listening on http://{}", listener.local_addr()?)
+        .context("cannot write to standard output")?;
+
+    let coordinator = Coordinator::new(Config {
+        version: VERSION.to_owned(),
+        term: args.lease_seconds,
+        scene_folder: folder.path().to_owned(),
+        picture_folder: folder.path().to_owned(),
+    });
+    coordinator.run(Listener::Tcp(listener), stop.cancelled()).await?;
+    Err(Failure::Interrupted)
+}

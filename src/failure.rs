@@ -1,0 +1,58 @@
+//! What went wrong, in one line, and the exit code that says so.
+
+use std::process::ExitCode;
+
+use crate::console::Console;
+
+/// Why a command did not do what it was asked to.
+#[derive(Debug)]
+pub(crate) enum Failure {
+    /// The command line or the scene is wrong.
+    Input(anyhow::Error),
+    /// The scene is wrong, and its diagnostics have said why.
+    Told,
+    /// Something failed.
+    Other(anyhow::Error),
+    /// Somebody stopped it.
+    Interrupted,
+}
+
+impl<E: Into<anyhow::Error>> From<E> for Failure {
+    fn from(error: E) -> Self {
+        Self::Other(error.into())
+    }
+}
+
+impl Failure {
+    /// Tells the user, and chooses the exit code.
+    pub(crate) fn tell(&self, console: &Console) -> ExitCode {
+        match self {
+            Self::Input(error) => {
+                console.tell(&format!("error: {error:#}"));
+                ExitCode::from(2)
+            }
+            Self::Told => ExitCode::from(2),
+            Self::Other(error) => {
+                console.tell(&format!("error: {error:#}"));
+                ExitCode::from(1)
+            }
+            Self::Interrupted => {
+                console.tell("error: interrupted");
+                ExitCode::from(130)
+            }
+        }
+    }
+}
+
+/// Shows help and versions as they are, and a usage error as one line.
+pub(crate) fn explain_usage(error: &clap::Error) -> ExitCode {
+    if !error.use_stderr() {
+        let is_shown = error.print().is_ok();
+        return if is_shown { ExitCode::SUCCESS } else { ExitCode::from(1) };
+    }
+    let text = error.to_string();
+    let (first, _) = text.split_once("\n\n").unwrap_or((&text, ""));
+    let words: Vec<&str> = first.split_whitespace().collect();
+    Console::plain().tell(&words.join(" "));
+    ExitCode::from(2)
+}

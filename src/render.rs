@@ -1,0 +1,270 @@
+//! `rtfarm render`: a picture from this machine alone.
+
+use std::{
+    fs,
+    io::{self, Read, Write},
+    os::unix::fs::PermissionsExt,
+    path::Path,
+    sync::Arc,
+    time::Duration,
+};
+
+use anyhow::{Context, anyhow};
+use rtfarm_coordinator::{
+    Config, Coordinator, End, Job, Listener, Order, Progress, Refusal, folder_of,
+};
+use rtfarm_core::{picture::Picture, read::draw_diagnostics, tile::Size};
+use rtfarm_proto::Address;
+use tempfile::TempDir;
+use tokio::{net::UnixListener, sync::watch, task::spawn_blocking, time::Instant};
+use tokio_util::sync::CancellationToken;
+
+use crate::{
+    VERSION,
+    args::{PictureArgs, RenderArgs},
+    children::{Children, Setup},
+    console::Console,
+    failure::Failure,
+    local,
+    output::Output,
+};
+
+/// What there is to say about a finished render.
+#[derive(Debug)]
+pub(crate) struct Summary {
+    pub(crate) size: Size,
+    pub(crate) rays: u64,
+    /// From the first lease to the last tile.
+    pub(crate) rendering: Duration,
+    pub(crate) workers: usize,
+}
+
+impl Summary {
+    /// Writes the one line that a render ends with.
+    pub(crate) fn tell(&self, started: Instant, output: &Output) -> anyhow::Result<()> {
+        let mrays = self.rays as f64 / 1e6;
+        writeln!(
+            io::stdout().lock(),
+            "{size} in {seconds:.2} s, {mrays:.1} Mrays, {rate:.1} Mrays/s, {workers} {noun}: {path}",
+            size = self.size,
+            seconds = started.elapsed().as_secs_f64(),
+            rate = mrays / self.rendering.as_secs_f64().max(1e-9),
+            workers = self.workers,
+            noun = if self.workers == 1 { "worker" } else { "workers" },
+            path = output.name().display()
+        )
+        .context("cannot write to standard output")
+    }
+}
+
+pub(crate) async fn run(
+    args: RenderArgs,
+    console: &Console,
+    stop: &CancellationToken,
+) -> Result<(), Failure> {
+    let started = Instant::now();
+    let mut output = args.picture.output().map_err(Failure::Input)?;
+    output.check()?;
+    let text = read_scene_text(&args.picture, stop).await?;
+    let order = place(&args.picture, &output, text, console, stop).await?;
+    let summary = match args.workers_and_threads() {
+        (0, threads) => render_here(order, threads, &args, &output, console, stop).await?,
+        workers => render_with_workers(order, workers, &args, &output, console, stop).await?,
+    };
+    summary.tell(started, &output)?;
+    Ok(())
+}
+
+/// Reads the scene's file or standard input.
+pub(crate) async fn read_scene_text(
+    args: &PictureArgs,
+    stop: &CancellationToken,
+) -> Result<Vec<u8>, Failure> {
+    let (path, is_from_stdin) = (args.scene.clone(), args.is_from_stdin());
+    let read = spawn_blocking(move || {
+        if is_from_stdin {
+            let mut text = Vec::new();
+            io::stdin().lock().read_to_end(&mut text).map(|_| text)
+        } else if fs::metadata(&path)?.is_dir() {
+            Err(io::Error::other("it is a folder"))
+        } else {
+            fs::read(&path)
+        }
+    });
+    let text = tokio::select! {
+        text = read => text?,
+        () = stop.cancelled() => return Err(Failure::Interrupted),
+    };
+    Ok(text.with_context(|| format!("cannot read the scene {}", args.scene_name()))?)
+}
+
+/// Reads and prepares the scene, and tells its diagnostics.
+async fn place(
+    args: &PictureArgs,
+    output: &Output,
+    text: Vec<u8>,
+    console: &Console,
+    stop: &CancellationToken,
+) -> Result<Order, Failure> {
+    let wish = args.wish(output.format());
+    let folder = if args.is_from_stdin() { ".".into() } else { folder_of(&args.scene) };
+    let (name, style) = (args.scene_name(), Console::drawing_style());
+    let placing = spawn_blocking(move || {
+        let placed = wish.place(&text, &|path: &str| fs::read(folder.join(Path::new(path))));
+        let mut report = draw_diagnostics(&name, &text, &placed.diagnostics, style);
+        report.extend(placed.omitted.summary());
+        (placed.order, report)
+    });
+    let (order, report) = tokio::select! {
+        placed = placing => placed?,
+        () = stop.cancelled() => return Err(Failure::Interrupted),
+    };
+    console.tell_report(&report);
+    order.map_err(|refusal| match refusal {
+        Refusal::Scene => Failure::Told,
+        Refusal::Other(reason) => {
+            Failure::Input(anyhow!("cannot render {}: {reason}", args.scene_name()))
+        }
+    })
+}
+
+async fn render_here(
+    order: Order,
+    threads: usize,
+    args: &RenderArgs,
+    output: &Output,
+    console: &Console,
+    stop: &CancellationToken,
+) -> Result<Summary, Failure> {
+    let size = order.settings.size;
+    let tile_count = order.grid.count();
+    let progress = watch::Sender::new(Progress { tile_count, ..Progress::default() });
+    let mut shown = progress.subscribe();
+    let bar = console.start_bar(tile_count);
+    let rendering = spawn_blocking({
+        let (folder, isa, stop) = (output.folder(), args.isa.0, stop.clone());
+        move || {
+            let rendered = local::render(order, &folder, (threads, isa), &progress, &stop);
+            let rays = progress.borrow().rays;
+            rendered.map(|rendered| (rendered, rays))
+        }
+    });
+    let show = async {
+        while shown.changed().await.is_ok() {
+            bar.show(&shown.borrow_and_update());
+        }
+    };
+    let (rendered, ()) = tokio::join!(rendering, show);
+    drop(bar);
+    let (Some((picture, rendering)), rays) = rendered?? else { return Err(Failure::Interrupted) };
+    write_picture(output, stop, move |write| write(&picture)).await?;
+    Ok(Summary { size, rays, rendering, workers: 0 })
+}
+
+async fn render_with_workers(
+    order: Order,
+    (workers, threads): (usize, usize),
+    args: &RenderArgs,
+    output: &Output,
+    console: &Console,
+    stop: &CancellationToken,
+) -> Result<Summary, Failure> {
+    let folder = private_folder(&std::env::temp_dir())?;
+    let socket = folder.path().join("socket");
+    let listener = UnixListener::bind(&socket)
+        .with_context(|| format!("cannot listen on {}", socket.display()))?;
+    let coordinator = Coordinator::new(Config {
+        version: VERSION.to_owned(),
+        term: args.lease_seconds,
+        scene_folder: folder.path().to_owned(),
+        picture_folder: output.folder(),
+    });
+    let job = spawn_blocking({
+        let coordinator = coordinator.clone();
+        move || coordinator.submit(order)
+    });
+    let job = job.await??;
+    let stop_serving = CancellationToken::new();
+    let serving = tokio::spawn({
+        let (coordinator, stop) = (coordinator.clone(), stop_serving.clone());
+        async move { coordinator.run(Listener::Unix(listener), stop.cancelled()).await }
+    });
+    let setup = Setup {
+        coordinator: Address::Unix(socket),
+        threads,
+        isa: args.isa.0,
+        log_format: args.log_format,
+    };
+    let mut children = Children::start(workers, &setup, console).context("cannot start workers")?;
+
+    let rendered = tokio::select! {
+        rendered = wait(&job, console) => rendered,
+        reason = children.watch(&coordinator) => {
+            Err(Failure::Other(anyhow!("all workers are dead; the last one: {reason}")))
+        }
+        () = stop.cancelled() => Err(Failure::Interrupted),
+    };
+    coordinator.close();
+    let written = match rendered {
+        Ok(rendering) => {
+            let picture = Arc::clone(&job);
+            let writing = write_picture(output, stop, move |write| write(picture.picture()));
+            let (written, ()) = tokio::join!(writing, children.go_home(&coordinator));
+            written.map(|()| rendering)
+        }
+        Err(failure) => {
+            coordinator.cancel(job.id());
+            children.end(&coordinator).await;
+            Err(failure)
+        }
+    };
+    stop_serving.cancel();
+    serving.await??;
+    let rays = job.progress().borrow().rays;
+    Ok(Summary { size: job.picture().size(), rays, rendering: written?, workers })
+}
+
+/// A folder that only this user can look into; it goes when the answer does.
+pub(crate) fn private_folder(parent: &Path) -> anyhow::Result<TempDir> {
+    tempfile::Builder::new()
+        .prefix("rtfarm-")
+        .permissions(fs::Permissions::from_mode(0o700))
+        .tempdir_in(parent)
+        .with_context(|| format!("cannot make a folder in {}", parent.display()))
+}
+
+/// Shows how far a job is until it ends.
+async fn wait(job: &Job, console: &Console) -> Result<Duration, Failure> {
+    let mut progress = job.progress();
+    let bar = console.start_bar(progress.borrow().tile_count);
+    loop {
+        {
+            let progress = progress.borrow_and_update();
+            bar.show(&progress);
+            match &progress.end {
+                Some(End::Finished(time)) => return Ok(*time),
+                Some(End::Failed(reason)) => return Err(Failure::Other(anyhow!("{reason}"))),
+                None => {}
+            }
+        }
+        progress.changed().await?;
+    }
+}
+
+/// Encodes a picture into its file. `with` hands the picture over.
+async fn write_picture(
+    output: &Output,
+    stop: &CancellationToken,
+    with: impl FnOnce(&mut dyn FnMut(&Picture) -> anyhow::Result<()>) -> anyhow::Result<()>
+    + Send
+    + 'static,
+) -> Result<(), Failure> {
+    let (output, token) = (output.clone(), stop.clone());
+    let written = spawn_blocking(move || {
+        with(&mut |picture| output.write(&token, |file| picture.encode(file)))
+    });
+    match written.await? {
+        Err(_) if stop.is_cancelled() => Err(Failure::Interrupted),
+        written => Ok(written?),
+    }
+}

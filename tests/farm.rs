@@ -1,0 +1,525 @@
+//! The whole farm as processes: the same bytes whoever renders them and whatever befalls them,
+//! logs that count, nothing left behind.
+
+use std::{
+    collections::BTreeSet,
+    fs::{self, File},
+    io::{BufRead, BufReader},
+    net::TcpListener,
+    path::{Path, PathBuf},
+    process::{Child, ChildStdout, Command, ExitStatus, Stdio},
+    thread,
+    time::Duration,
+};
+
+use rustix::process::{Pid, Signal, kill_process, test_kill_process};
+use tempfile::TempDir;
+
+/// A picture that takes one thread some seconds, cut into this many tiles.
+const SLOW: [&str; 6] = ["--size", "320x240", "--samples", "1024", "--tile", "16"];
+const SLOW_TILE_COUNT: usize = 20 * 15;
+
+/// How long anything here may take.
+const PATIENCE: Duration = Duration::from_secs(50);
+
+/// A few spheres, a triangle and a quadrangle in the light of two lamps.
+fn scene_text() -> String {
+    let head = "\
+viewport
+    origin 0 1 -6
+    topleft -1.6 2.2 -3
+    bottomleft -1.6 -0.2 -3
+    topright 1.6 2.2 -3
+    background 20 30 40
+endviewport
+materials
+    entry
+        name red
+        color 230 60 40
+    endentry
+    entry
+        name grey
+        color 180 180 170
+    endentry
+endmaterials
+lights
+    ambient 0.2
+    reference
+        power 1
+        distance 4
+    endreference
+    point
+        coords 3 5 -4
+        power 1
+    endpoint
+    point
+        coords -4 3 -2
+        power 0.5
+    endpoint
+endlights
+geometry
+    triangle
+        vertex -2 0 2
+        vertex 2 0 2
+        vertex 0 3 2
+        material red
+    endtriangle
+    quadrangle
+        vertex -6 -1 -6
+        vertex 6 -1 -6
+        vertex 6 -1 6
+        vertex -6 -1 6
+        material grey
+    endquadrangle
+";
+    let sphere = |number: u32| {
+        let (x, y) = (f64::from(number % 4) - 1.5, f64::from(number / 4) * 0.9 - 0.4);
+        let material = if number.is_multiple_of(2) { "red" } else { "grey" };
+        format!("sphere\n coords {x} {y} 0.5\n radius 0.4\n material {material}\nendsphere\n")
+    };
+    let spheres: Vec<String> = (0..12).map(sphere).collect();
+    [head, &spheres.concat(), "endgeometry\n"].concat()
+}
+
+/// A folder with a scene in it and a folder for temporary files, where nothing may stay.
+struct Place {
+    folder: TempDir,
+}
+
+impl Place {
+    fn new() -> Self {
+        let place = Self { folder: tempfile::tempdir().unwrap() };
+        fs::create_dir(place.path("tmp")).unwrap();
+        fs::write(place.path("scene.rt"), scene_text()).unwrap();
+        place
+    }
+
+    fn path(&self, name: &str) -> PathBuf {
+        self.folder.path().join(name)
+    }
+
+    /// Starts the program; what it says to standard error goes to the file `log`.
+    fn start(&self, log: &str, args: &[&str]) -> Process {
+        let mut child = Command::new(env!("CARGO_BIN_EXE_rtfarm"))
+            .args(args)
+            .current_dir(self.folder.path())
+            .env("TMPDIR", self.path("tmp"))
+            .env_remove("RUST_LOG")
+            .stdin(Stdio::null())
+            .stdout(Stdio::piped())
+            .stderr(File::create(self.path(log)).unwrap())
+            .spawn()
+            .unwrap();
+        let stdout = child.stdout.take().map(BufReader::new);
+        Process { child, stdout, log: self.path(log) }
+    }
+
+    /// Runs `render` to its good end; answers with the picture's bytes.
+    fn render(&self, output: &str, args: &[&str]) -> Vec<u8> {
+        let mut process =
+            self.start("log", &[&["render", "scene.rt", "-o", output], args].concat());
+        assert!(process.wait().success(), "{args:?}: {}", process.log());
+        fs::read(self.path(output)).unwrap()
+    }
+
+    /// Everything in the folder, to be compared before and after.
+    fn files(&self) -> BTreeSet<PathBuf> {
+        let list = |folder: &Path| -> Vec<PathBuf> {
+            fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path()).collect()
+        };
+        let mut files: BTreeSet<PathBuf> = list(self.folder.path()).into_iter().collect();
+        files.extend(list(&self.path("tmp")));
+        files
+    }
+
+    fn check_nothing_is_left(&self) {
+        assert_eq!(fs::read_dir(self.path("tmp")).unwrap().count(), 0, "{:?}", self.files());
+        let hidden = |path: &PathBuf| path.file_name().unwrap().as_encoded_bytes()[0] == b'.';
+        assert!(!self.files().iter().any(hidden), "{:?}", self.files());
+    }
+}
+
+/// The program, running. It is killed if a test fails.
+struct Process {
+    child: Child,
+    stdout: Option<BufReader<ChildStdout>>,
+    log: PathBuf,
+}
+
+impl Drop for Process {
+    fn drop(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+impl Process {
+    fn log(&self) -> String {
+        fs::read_to_string(&self.log).unwrap()
+    }
+
+    fn wait(&mut self) -> ExitStatus {
+        poll(|| self.child.try_wait().unwrap())
+    }
+
+    fn signal(&self, signal: Signal) {
+        kill_process(pid(self.child.id()), signal).unwrap();
+    }
+
+    fn read_line(&mut self) -> String {
+        let mut line = String::new();
+        self.stdout.as_mut().unwrap().read_line(&mut line).unwrap();
+        line
+    }
+
+    /// The workers that have joined so far: number and process.
+    fn workers(&self) -> Vec<(u32, u32)> {
+        let log = self.log();
+        let joined = log.lines().filter(|line| line.contains("worker joined"));
+        joined.map(|line| (field(line, "worker"), field(line, "process"))).collect()
+    }
+
+    fn tiles_done(&self) -> usize {
+        finished_tiles(&self.log()).len()
+    }
+}
+
+/// Asks until there is an answer.
+fn poll<T>(mut ask: impl FnMut() -> Option<T>) -> T {
+    const PERIOD: Duration = Duration::from_millis(5);
+    for _ in 0..PATIENCE.as_millis() / PERIOD.as_millis() {
+        if let Some(answer) = ask() {
+            return answer;
+        }
+        thread::sleep(PERIOD);
+    }
+    panic!("nothing happened for {PATIENCE:?}");
+}
+
+fn pid(process: u32) -> Pid {
+    Pid::from_raw(i32::try_from(process).unwrap()).unwrap()
+}
+
+/// Waits until a process is gone or waits only to be reaped.
+fn wait_for_end_of(process: u32) {
+    poll(|| {
+        let is_gone = test_kill_process(pid(process)).is_err();
+        let status = fs::read_to_string(format!("/proc/{process}/stat")).unwrap_or_default();
+        (is_gone || status.is_empty() || status.contains(") Z ")).then_some(())
+    });
+}
+
+/// The number in a field of a log line.
+fn field(line: &str, name: &str) -> u32 {
+    let (_, value) = line.split_once(&format!(" {name}=")).unwrap_or_else(|| panic!("{line}"));
+    let digits: String = value.chars().take_while(char::is_ascii_digit).collect();
+    digits.parse().unwrap_or_else(|_| panic!("{name} in {line}"))
+}
+
+/// The numbers of the tiles that a log calls finished.
+fn finished_tiles(log: &str) -> Vec<u32> {
+    let done = log.lines().filter(|line| line.contains(" tile ") && line.contains(" done "));
+    done.map(|line| field(line, "tile")).collect()
+}
+
+fn check_each_tile_once(log: &str, tile_count: usize) {
+    let tiles = finished_tiles(log);
+    assert_eq!(tiles.len(), tile_count);
+    assert_eq!(tiles.iter().collect::<BTreeSet<_>>().len(), tile_count);
+}
+
+#[test]
+fn pictures_do_not_depend_on_workers_threads_and_tiles() {
+    let place = Place::new();
+    for size in ["96x64", "101x67", "31x131"] {
+        for output in ["out.png", "out.exr"] {
+            let common = ["--size", size, "--samples", "3"];
+            let expected = place
+                .render(output, &[&common[..], &["--workers", "0", "--threads", "2"]].concat());
+            for (workers, threads) in [("1", ["1", "3"]), ("2", ["1", "2"]), ("5", ["1", "2"])] {
+                for (tile, threads) in [("8", threads[0]), ("17", threads[1]), ("64", threads[0])] {
+                    let farm = ["--workers", workers, "--threads", threads, "--tile", tile];
+                    let found = place.render(output, &[&common[..], &farm].concat());
+                    assert!(found == expected, "{size} {output} {farm:?}");
+                }
+            }
+        }
+    }
+    place.check_nothing_is_left();
+}
+
+#[test]
+fn a_killed_and_a_stopped_worker_change_nothing() {
+    let place = Place::new();
+    let farm = ["--workers", "3", "--threads", "1", "--lease-seconds", "0.5"];
+    let args = [&["render", "scene.rt", "-o", "out.png"], &SLOW[..], &farm].concat();
+    let mut render = place.start("render.log", &args);
+    poll(|| (render.tiles_done() >= 10 && render.workers().len() == 3).then_some(()));
+    let workers = render.workers();
+    kill_process(pid(workers[0].1), Signal::KILL).unwrap();
+    kill_process(pid(workers[1].1), Signal::STOP).unwrap();
+    let status = render.wait();
+    let log = render.log();
+    assert!(status.success(), "{log}");
+
+    check_each_tile_once(&log, SLOW_TILE_COUNT);
+    for ((worker, _), reason) in
+        workers.iter().zip(["reason=\"killed by signal 9\"", "reason=\"no progress for 0.5 s\""])
+    {
+        let is_told = |line: &str| {
+            line.contains("lease lost")
+                && line.contains(&format!(" worker={worker} tiles="))
+                && line.contains(reason)
+        };
+        assert!(log.lines().any(is_told), "{worker} {reason}: {log}");
+    }
+    for (_, process) in workers {
+        wait_for_end_of(process);
+    }
+    let here = place.render("here.png", &[&SLOW[..], &["--workers", "0"]].concat());
+    assert!(fs::read(place.path("out.png")).unwrap() == here);
+    place.check_nothing_is_left();
+}
+
+#[test]
+fn without_workers_a_render_fails_and_says_why() {
+    let place = Place::new();
+    let args = [&["render", "scene.rt", "-o", "out.png", "--workers", "1"], &SLOW[..]].concat();
+    let mut render = place.start("render.log", &args);
+    poll(|| (render.tiles_done() >= 1).then_some(()));
+    kill_process(pid(render.workers()[0].1), Signal::KILL).unwrap();
+    assert_eq!(render.wait().code(), Some(1));
+    let log = render.log();
+    let last = log.lines().last().unwrap();
+    assert_eq!(last, "error: all workers are dead; the last one: killed by signal 9");
+    assert!(!place.path("out.png").exists());
+    place.check_nothing_is_left();
+}
+
+#[test]
+fn logs_count_every_tile_as_text_and_as_json() {
+    let place = Place::new();
+    let common = ["--size", "101x67", "--samples", "1", "--tile", "8", "--workers", "2"];
+    let tile_count = 13 * 9;
+    place.render("out.png", &common);
+    check_each_tile_once(&fs::read_to_string(place.path("log")).unwrap(), tile_count);
+
+    place.render("out.png", &[&common[..], &["--log-format", "json"]].concat());
+    let log = fs::read_to_string(place.path("log")).unwrap();
+    let mut tiles = BTreeSet::new();
+    for line in log.lines() {
+        let line: serde_json::Value = serde_json::from_str(line).expect(line);
+        if line["message"].as_str().unwrap().ends_with(" done") {
+            assert!(line["worker"].is_u64() && line["ms"].is_u64() && line["mrays"].is_f64());
+            assert!(tiles.insert(line["tile"].as_u64().unwrap()), "{line}");
+        }
+    }
+    assert_eq!(tiles.len(), tile_count);
+}
+
+#[test]
+fn a_farm_over_tcp_gives_the_same_bytes() {
+    let place = Place::new();
+    let mut coordinator =
+        place.start("coordinator.log", &["coordinator", "--listen", "127.0.0.1:0"]);
+    let line = coordinator.read_line();
+    let url = line.trim().strip_prefix("listening on ").expect(&line);
+    let worker = ["worker", "--threads", "1", "--coordinator", url];
+    let mut workers = [place.start("worker-a.log", &worker), place.start("worker-b.log", &worker)];
+    for output in ["farm.png", "farm.exr"] {
+        let picture = ["--size", "103x59", "--samples", "2", "--coordinator", url];
+        let args = [&["submit", "scene.rt", "-o", output], &picture[..]].concat();
+        let mut submit = place.start("submit.log", &args);
+        assert!(submit.wait().success(), "{}", submit.log());
+        let here = place.render(
+            &format!("here-{output}"),
+            &["--size", "103x59", "--samples", "2", "--workers", "0"],
+        );
+        assert!(fs::read(place.path(output)).unwrap() == here, "{output}");
+    }
+
+    let other = ["worker", "--coordinator", url, "--claim-version", "0.0.0"];
+    check_refused(&place, &other, 1, "this worker is rtfarm 0.0.0");
+
+    coordinator.signal(Signal::TERM);
+    assert_eq!(coordinator.wait().code(), Some(130), "{}", coordinator.log());
+    for worker in &mut workers {
+        assert!(worker.wait().success(), "sent home: {}", worker.log());
+    }
+    place.check_nothing_is_left();
+}
+
+#[test]
+fn an_interrupted_submit_ends_its_job() {
+    let place = Place::new();
+    let mut coordinator =
+        place.start("coordinator.log", &["coordinator", "--listen", "127.0.0.1:0"]);
+    let line = coordinator.read_line();
+    let url = line.trim().strip_prefix("listening on ").expect(&line);
+    let _worker = place.start("worker.log", &["worker", "--threads", "1", "--coordinator", url]);
+    let args = [&["submit", "scene.rt", "-o", "out.png", "--coordinator", url], &SLOW[..]].concat();
+    let mut submit = place.start("submit.log", &args);
+    poll(|| (coordinator.tiles_done() >= 3).then_some(()));
+    submit.signal(Signal::INT);
+    assert_eq!(submit.wait().code(), Some(130), "{}", submit.log());
+    poll(|| coordinator.log().contains("job cancelled").then_some(()));
+    assert!(!place.path("out.png").exists());
+
+    let quick = ["--size", "32x32", "--samples", "1", "--coordinator", url];
+    let args = [&["submit", "scene.rt", "-o", "next.png"], &quick[..]].concat();
+    let mut next = place.start("next.log", &args);
+    assert!(next.wait().success(), "the worker is free again: {}", next.log());
+    coordinator.signal(Signal::INT);
+    coordinator.wait();
+    place.check_nothing_is_left();
+}
+
+#[test]
+fn an_interrupted_render_leaves_nothing() {
+    let place = Place::new();
+    for (signal, here) in [(Signal::INT, "2"), (Signal::TERM, "2"), (Signal::INT, "0")] {
+        let args =
+            [&["render", "scene.rt", "-o", "out.png", "--workers", here], &SLOW[..]].concat();
+        let mut render = place.start("render.log", &args);
+        poll(|| (render.tiles_done() >= 3).then_some(()));
+        let workers = render.workers();
+        if let Some(&(_, stopped)) = workers.first() {
+            kill_process(pid(stopped), Signal::STOP).unwrap();
+        }
+        render.signal(signal);
+        assert_eq!(render.wait().code(), Some(130), "{}", render.log());
+        let log = render.log();
+        assert!(log.ends_with("error: interrupted\n") && !log.contains("lease lost"), "{log}");
+        for (_, process) in workers {
+            wait_for_end_of(process);
+        }
+        assert!(!place.path("out.png").exists());
+        place.check_nothing_is_left();
+    }
+}
+
+#[test]
+fn workers_die_with_a_killed_coordinator() {
+    let place = Place::new();
+    let args = [&["render", "scene.rt", "-o", "out.png", "--workers", "2"], &SLOW[..]].concat();
+    let mut render = place.start("render.log", &args);
+    poll(|| (render.tiles_done() >= 1 && render.workers().len() == 2).then_some(()));
+    let workers = render.workers();
+    kill_process(pid(workers[0].1), Signal::STOP).unwrap();
+    render.signal(Signal::KILL);
+    render.wait();
+    for (_, process) in workers {
+        wait_for_end_of(process);
+    }
+}
+
+/// Checks that a command fails with one line that says `reason`, and changes nothing.
+fn check_refused(place: &Place, args: &[&str], code: i32, reason: &str) {
+    fs::write(place.path("refused.log"), "").unwrap();
+    let before = place.files();
+    let mut process = place.start("refused.log", args);
+    let status = process.wait();
+    let log = process.log();
+    let lines: Vec<&str> = log.lines().collect();
+    assert_eq!(lines.len(), 1, "{args:?}: {log}");
+    assert!(lines[0].starts_with("error: ") && lines[0].contains(reason), "{args:?}: {log}");
+    assert_eq!(status.code(), Some(code), "{args:?}: {log}");
+    assert_eq!(place.files(), before, "{args:?}");
+}
+
+#[test]
+fn bad_input_gives_one_clear_line_and_an_exit_code() {
+    let place = Place::new();
+    fs::create_dir(place.path("folder.png")).unwrap();
+    for (scene, output, rest, code, reason) in [
+        ("nowhere.rt", "o.png", "", 1, "cannot read the scene nowhere.rt: No such file"),
+        ("tmp", "o.png", "", 1, "cannot read the scene tmp: it is a folder"),
+        ("scene.rt", "o.gif", "", 2, "must end in .png or .exr"),
+        ("scene.rt", "png", "", 2, "must end in .png or .exr"),
+        ("scene.rt", "o.exr", "--depth=16", 2, "--depth is for PNG"),
+        ("scene.rt", "folder.png", "", 1, "is a folder"),
+        ("scene.rt", "nowhere/o.png", "", 1, "cannot write into the folder nowhere: No such"),
+        ("scene.rt", "/proc/o.png", "", 1, "cannot write into the folder /proc"),
+        ("scene.rt", "o.png", "--size=0x0", 2, "not 0x0"),
+        ("scene.rt", "o.png", "--size=100000x100000", 2, "not 100000x100000"),
+        ("scene.rt", "o.png", "--size=1e3x5", 2, "a size looks like 1280x720"),
+        ("scene.rt", "o.png", "--tile=2", 2, "2 is not in 4..=1024"),
+        ("scene.rt", "o.png", "--samples=0", 2, "0 is not in 1..=65536"),
+        ("scene.rt", "o.png", "--isa=mmx", 2, "`mmx` is not an instruction set"),
+        ("scene.rt", "o.png", "--wokers=2", 2, "unexpected argument '--wokers'"),
+    ] {
+        let args = ["render", scene, "-o", output, rest];
+        let given = if rest.is_empty() { 4 } else { 5 };
+        check_refused(&place, &args[..given], code, reason);
+    }
+    check_refused(&place, &["render", "scene.rt"], 2, "--output <FILE>");
+    let huge = ["render", "scene.rt", "-o", "o.png", "--size", "65535x65535", "--tile", "4"];
+    check_refused(&place, &huge, 2, "at most 1048576 tiles");
+    let open = ["coordinator", "--listen", "0.0.0.0:0"];
+    check_refused(&place, &open, 2, "--insecure");
+    check_refused(&place, &["worker", "--coordinator", "host"], 2, "is no coordinator's address");
+    place.check_nothing_is_left();
+}
+
+#[test]
+fn a_port_in_use_and_a_missing_coordinator_are_told() {
+    let place = Place::new();
+    let taken = TcpListener::bind("127.0.0.1:0").unwrap();
+    let address = taken.local_addr().unwrap().to_string();
+    let reason = format!("cannot listen on {address}: Address already in use");
+    check_refused(&place, &["coordinator", "--listen", &address], 1, &reason);
+
+    drop(taken);
+    let url = format!("http://{address}");
+    let reason = format!("no coordinator answers at {url}: ");
+    let worker = ["worker", "--coordinator", &url, "--patience", "0.2"];
+    check_refused(&place, &worker, 1, &reason);
+    let submit = ["submit", "scene.rt", "-o", "out.png", "--coordinator", &url];
+    check_refused(&place, &submit, 1, &reason);
+    place.check_nothing_is_left();
+}
+
+#[test]
+fn a_full_disk_is_told_at_once() {
+    let place = Place::new();
+    let disk = place.path("disk");
+    fs::create_dir(&disk).unwrap();
+    let mounted = Command::new("mount")
+        .args(["-t", "tmpfs", "-o", "size=64k", "none"])
+        .arg(&disk)
+        .output()
+        .is_ok_and(|output| output.status.success());
+    if !mounted {
+        eprintln!("SKIPPED: only root can mount the small disk that this test fills");
+        return;
+    }
+    let check = std::panic::catch_unwind(|| {
+        for workers in ["0", "2"] {
+            let size = ["--size", "512x512", "--samples", "1", "--workers", workers];
+            let args = [&["render", "scene.rt", "-o", "disk/out.png"], &size[..]].concat();
+            check_refused(&place, &args, 1, "No space left on device");
+        }
+        assert_eq!(fs::read_dir(&disk).unwrap().count(), 0);
+        place.check_nothing_is_left();
+    });
+    assert!(Command::new("umount").arg(&disk).status().unwrap().success());
+    check.unwrap();
+}
+
+#[test]
+fn the_scene_may_come_from_standard_input() {
+    let place = Place::new();
+    let common = ["--size", "40x30", "--samples", "1"];
+    let expected = place.render("file.png", &common);
+    let status = Command::new(env!("CARGO_BIN_EXE_rtfarm"))
+        .args([&["render", "-", "-o", "stdin.png"], &common[..]].concat())
+        .current_dir(place.folder.path())
+        .env("TMPDIR", place.path("tmp"))
+        .stdin(File::open(place.path("scene.rt")).unwrap())
+        .stdout(Stdio::null())
+        .stderr(Stdio::null())
+        .status()
+        .unwrap();
+    assert!(status.success());
+    assert!(fs::read(place.path("stdin.png")).unwrap() == expected);
+}

@@ -1,0 +1,113 @@
+//! What is seen along a ray.
+
+use glam::DVec3;
+use rtfarm_core::scene::Material;
+
+use crate::{
+    face::{Crossing, Leaving},
+    oracle::{Hit, Oracle, hit},
+    ray::Ray,
+};
+
+/// What a picture depends on besides the scene and the samples.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Settings {
+    /// Every surface shows its plain colour, as in a scene without light.
+    pub flat: bool,
+    /// A branch whose weight is below this is not traced.
+    pub cutoff: f64,
+}
+
+impl Default for Settings {
+    fn default() -> Self {
+        Self { flat: false, cutoff: 1.0 / 4096.0 }
+    }
+}
+
+/// The last mirrored or transmitted ray that is traced; the eye's ray has depth 0.
+const MAX_DEPTH: u32 = 64;
+
+/// A ray of the tree that the eye's ray grows into.
+struct Branch {
+    origin: DVec3,
+    /// Of length 1, but for the eye's ray.
+    direction: DVec3,
+    leaving: Option<Leaving>,
+    depth: u32,
+    /// The product of the factors that it will be multiplied with.
+    weight: f64,
+}
+
+impl Oracle {
+    /// The colour that an eye at `origin` sees along `direction`, of any length.
+    pub fn radiance(&self, origin: DVec3, direction: DVec3, settings: &Settings) -> DVec3 {
+        let branch = Branch { origin, direction, leaving: None, depth: 0, weight: 1.0 };
+        self.branch_radiance(&branch, settings)
+    }
+
+    fn branch_radiance(&self, branch: &Branch, settings: &Settings) -> DVec3 {
+        if branch.depth > MAX_DEPTH || branch.weight < settings.cutoff {
+            return self.scene.background;
+        }
+        let ray = Ray::along(branch.origin, branch.direction);
+        let Some(crossing) = self.first_crossing(&ray, branch.leaving) else {
+            return self.scene.background;
+        };
+        let hit = hit(&ray, &crossing);
+        let material = &self.scene.materials[hit.material as usize];
+        let direction = branch.direction.normalize();
+
+        let follow = |direction: DVec3, through: bool, factor: f64| {
+            let child = Branch {
+                origin: hit.point,
+                direction,
+                leaving: Some(Leaving { id: hit.id, through }),
+                depth: branch.depth + 1,
+                weight: branch.weight * factor,
+            };
+            self.branch_radiance(&child, settings)
+        };
+        let mirrored = direction - 2.0 * direction.dot(hit.normal) * hit.normal;
+        let (reflect, alpha) = (material.reflect, material.alpha);
+
+        let mut radiance = DVec3::ZERO;
+        if reflect > 0.0 {
+            radiance += reflect * follow(mirrored, false, reflect);
+        }
+        if reflect < 1.0 && alpha > 0.0 {
+            let surface = material.color * self.irradiance(&crossing, &hit, settings);
+            radiance += (1.0 - reflect) * alpha * surface;
+        }
+        if reflect < 1.0 && alpha < 1.0 {
+            let factor = (1.0 - reflect) * (1.0 - alpha);
+            let transmitted = match transmitted_direction(direction, &hit, material) {
+                Some(bent) => follow(bent, true, factor),
+                None => follow(mirrored, false, factor),
+            };
+            radiance += factor * transmitted;
+        }
+        radiance
+    }
+
+    /// E: the light on the side of the face that the ray came from.
+    fn irradiance(&self, crossing: &Crossing<'_>, hit: &Hit, settings: &Settings) -> DVec3 {
+        if settings.flat || self.scene.lights.is_empty() && self.scene.ambient.is_none() {
+            return DVec3::ONE;
+        }
+        self.scene.ambient.unwrap_or(DVec3::ZERO) + self.direct_light(crossing, hit)
+    }
+}
+
+/// Where light goes on behind the face, by Snell's law; `None` on total internal reflection.
+/// `direction` has length 1.
+fn transmitted_direction(direction: DVec3, hit: &Hit, material: &Material) -> Option<DVec3> {
+    if material.refract == 0.0 || material.refract == 1.0 {
+        return Some(direction);
+    }
+    let ratio = if hit.front { material.refract } else { 1.0 / material.refract };
+    let cosine = -direction.dot(hit.normal);
+    let cosine_squared = 1.0 - ratio * ratio * (1.0 - cosine) * (1.0 + cosine);
+    (cosine_squared >= 0.0)
+        .then(|| ratio * direction + (ratio * cosine - cosine_squared.sqrt()) * hit.normal)
+        .map(DVec3::normalize)
+}
