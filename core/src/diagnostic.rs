@@ -44,6 +44,8 @@ impl Diagnostic {
     pub fn at_place(severity: Severity, text: &[u8], at: Place, message: String) -> Self {
         let lines = text.split_inclusive(|&byte| byte == b'\n');
         let line_start: usize = lines.take(at.line as usize - 1).map(<[u8]>::len).sum();
+        let has_mark = line_start == 0 && text.starts_with(BYTE_ORDER_MARK);
+        let line_start = if has_mark { BYTE_ORDER_MARK.len() } else { line_start };
         // A character begins with any byte but a continuation byte.
         let begins = |&&byte: &&u8| byte & 0xC0 != 0x80;
         let mut characters = 0;

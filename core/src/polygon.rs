@@ -27,9 +27,7 @@ pub(crate) fn triangulate(points: &[DVec3], mut emit: impl FnMut([usize; 3])) ->
     let power = -exponent(largest);
     let scaled: Vec<DVec3> =
         points.iter().map(|point| point.map(|number| scale_by_power(number, power))).collect();
-    // Newell's normal, taken about the first corner.
-    let along = |k: usize| scaled[k] - scaled[0];
-    let normal: DVec3 = (1..count - 1).map(|k| along(k).cross(along(k + 1))).sum();
+    let normal = newell_normal(&scaled);
     let size = normal.abs();
     let axis = (0..3).max_by(|&j, &k| size[j].total_cmp(&size[k])).unwrap_or(0);
     let flat: Vec<DVec2> = scaled
@@ -59,6 +57,15 @@ pub(crate) fn triangulate(points: &[DVec3], mut emit: impl FnMut([usize; 3])) ->
     }
     emit([ring.previous[corner], corner, ring.next[corner]]);
     true
+}
+
+/// Newell's normal of a polygon: twice its area, towards the side that sees it counter-clockwise.
+/// Source: Sutherland, Sproull & Schumacker, "A Characterization of Ten Hidden-Surface
+/// Algorithms" (1974), who credit M. E. Newell. Taken about the first corner, so that it does not
+/// lose digits far from the origin.
+fn newell_normal(points: &[DVec3]) -> DVec3 {
+    let from_first = |k: usize| points[k] - points[0];
+    (1..points.len() - 1).map(|k| from_first(k).cross(from_first(k + 1))).sum()
 }
 
 /// How a, b, c turn: `Greater` to the left. Rounded: files round the corners of their polygons
