@@ -757,11 +757,23 @@ fn bounds_of(points: &[DVec3]) -> (DVec3, DVec3) {
 /// The faces of a parallelepiped, each counter-clockwise seen from outside: 2k is the one through
 /// the corner that edge k leaves, 2k + 1 the one opposite.
 fn box_faces(solid: &Parallelepiped) -> [[DVec3; 4]; 6] {
-    let spans = box_spans(solid);
+    let [u, v, w] = solid.edges;
+    let is_left_handed = u.dot(v.cross(w)) < 0.0;
+    // Every face adds edges in the same order: faces that share a corner agree on its bits.
+    let corner = |is_far: [bool; 3]| {
+        solid.edges.iter().zip(is_far).fold(solid.corner, |corner, (&edge, is_far)| {
+            if is_far { corner + edge } else { corner }
+        })
+    };
     std::array::from_fn(|face| {
-        let away = if face % 2 == 1 { solid.edges[face / 2] } else { DVec3::ZERO };
-        let (start, [e, f]) = (solid.corner + away, spans[face]);
-        [start, start + e, start + e + f, start + f]
+        let (axis, is_far) = (face / 2, face % 2 == 1);
+        let (e, f) = ((axis + 1) % 3, (axis + 2) % 3);
+        let (e, f) = if is_far == is_left_handed { (f, e) } else { (e, f) };
+        [[false, false], [true, false], [true, true], [false, true]].map(|[along_e, along_f]| {
+            let mut at = [is_far; 3];
+            (at[e], at[f]) = (along_e, along_f);
+            corner(at)
+        })
     })
 }
 
