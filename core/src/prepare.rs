@@ -110,13 +110,13 @@ pub fn prepare(scene: &Scene) -> Result<PreparedBytes, PrepareError> {
         coplanars: &sorted.coplanars,
         quadrangles: &sorted.quadrangles,
         spheres: &sorted.spheres,
-        planes: &sorted.planes,
+        planes: sorted.planes,
         materials: &materials,
         lights: &lights,
         touches: &touches,
         solids: &sorted.solids,
-        solid_nodes: &sorted.solid_nodes,
-        leaves: &sorted.leaves,
+        solid_nodes: sorted.solid_nodes,
+        leaves: sorted.leaves,
         first_ranks: &ranks.firsts,
     };
     Ok(assemble(camera, lighting, frame, scale, features(scene), &sections))
@@ -468,13 +468,11 @@ impl Faces {
 
     /// The rank of a flat face, those of solids included.
     fn rank(&self, face: usize) -> u32 {
-        match self.wear.get(face) {
-            Some(&(_, rank)) => rank,
-            None => {
-                let of_solids = face - self.flat_count();
-                self.boxes[of_solids / 6].1 + (of_solids % 6) as u32
-            }
+        if let Some(&(_, rank)) = self.wear.get(face) {
+            return rank;
         }
+        let of_solids = face - self.flat_count();
+        self.boxes[of_solids / 6].1 + (of_solids % 6) as u32
     }
 
     /// Gives flat faces in exactly one plane one record, that of the face that comes first.

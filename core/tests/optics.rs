@@ -5,7 +5,7 @@
 mod parts;
 mod studio;
 
-use std::ops::ControlFlow;
+use std::{fmt::Write, ops::ControlFlow};
 
 use glam::DVec3;
 use parts::{join, rays, sphere, upright};
@@ -83,16 +83,11 @@ fn a_mirror_shows_the_mirrored_scene() {
         let geometry = |sign: f64| -> String {
             let thing = |&(place, size, is_round): &(DVec3, f64, bool)| {
                 let place = place * DVec3::new(1.0, 1.0, sign);
-                match is_round {
-                    true => sphere(place, size, "glass"),
-                    false => join(
-                        "difference",
-                        &[
-                            &upright(place - size, place + size, "red"),
-                            &sphere(place, size * 1.2, "white"),
-                        ],
-                    ),
+                if is_round {
+                    return sphere(place, size, "glass");
                 }
+                let cube = upright(place - size, place + size, "red");
+                join("difference", &[&cube, &sphere(place, size * 1.2, "white")])
             };
             things.iter().map(thing).collect()
         };
@@ -117,9 +112,11 @@ fn a_white_world_stays_white_whatever_mirrors_and_bends() {
         let mut materials = String::new();
         for (name, reflect) in [("a", 0.0), ("b", 0.4), ("c", 0.1)] {
             let (alpha, ratio) = (random.unit(), random.between(0.4, 2.5));
-            materials += &format!(
+            write!(
+                materials,
                 "entry name {name} alpha {alpha:?} reflect {reflect:?} refract {ratio:?} endentry "
-            );
+            )
+            .unwrap();
         }
         let geometry = sphere(random.in_cube(), 1.5, "a")
             + &upright(random.in_cube() - 1.5, random.in_cube() + 1.0, "b")

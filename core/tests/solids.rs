@@ -2,8 +2,6 @@
 //!
 //! `RTFARM_RAYS=100` takes a hundred times as many rays.
 
-#![expect(clippy::float_cmp, reason = "what holds exactly is tested exactly")]
-
 mod parts;
 
 use std::{f64::consts::PI, thread};
