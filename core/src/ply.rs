@@ -23,12 +23,15 @@ pub(crate) fn read_ply(bytes: &[u8]) -> Result<MeshFile, MeshError> {
     let [Some(_), Some(_), Some(_)] = coordinates else {
         return Err(MeshFault::Missing("x, y and z of vertices").of_file());
     };
+    // What the header announces, as far as the file is long enough for it.
+    let least_size = vertex.least_size(header.format).max(1);
+    let expected = vertex.count.min((bytes.len() / least_size) as u64) as usize;
     if coordinates.iter().flatten().all(|&(_, kind)| kind == Number::Float) {
         let single = |number: f64| number as f32 + 0.0;
-        read_elements(&header, bytes, MeshBuilder::with_capacity(0, 0), single)?.into_mesh()
+        read_elements(&header, bytes, MeshBuilder::with_capacity(expected, 0), single)?.into_mesh()
     } else {
         let double = |number: f64| number + 0.0;
-        read_elements(&header, bytes, MeshBuilder::with_capacity(0, 0), double)?.into_mesh()
+        read_elements(&header, bytes, MeshBuilder::with_capacity(expected, 0), double)?.into_mesh()
     }
 }
 
