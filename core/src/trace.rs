@@ -82,10 +82,15 @@ impl Batch for Trace<'_> {
         let mut scratch = Scratch::default();
         for ray in self.rays {
             let mut nearest = Nearest::new(ray);
-            visit::<K>(view, ray, |item| {
-                nearest.meet(view, item, &mut scratch);
-                Step::On(nearest.hit.t)
-            });
+            visit::<K>(
+                view,
+                ray,
+                || (),
+                |item| {
+                    nearest.meet(view, item, &mut scratch);
+                    Step::On(nearest.hit.t)
+                },
+            );
             self.hits.push(nearest.hit);
         }
     }
@@ -105,12 +110,17 @@ impl Batch for Shadows<'_> {
         for ray in self.rays {
             let shear = Shear::new(ray.origin, ray.direction);
             let mut is_blocked = false;
-            visit::<K>(view, ray, |item| {
-                between(view, ray, &shear, self.touches, item, &mut scratch, |_, _| {
-                    is_blocked = true;
-                });
-                if is_blocked { Step::Enough } else { Step::On(ray.reach) }
-            });
+            visit::<K>(
+                view,
+                ray,
+                || (),
+                |item| {
+                    between(view, ray, &shear, self.touches, item, &mut scratch, |_, _| {
+                        is_blocked = true;
+                    });
+                    if is_blocked { Step::Enough } else { Step::On(ray.reach) }
+                },
+            );
             self.shares.push(if is_blocked { 0.0 } else { 1.0 });
         }
     }
@@ -132,15 +142,20 @@ impl Batch for ClearShadows<'_> {
             let shear = Shear::new(ray.origin, ray.direction);
             crossed.clear();
             let mut is_blocked = false;
-            visit::<K>(view, ray, |item| {
-                between(view, ray, &shear, self.touches, item, &mut scratch, |rank, part| {
-                    let material = &view.materials[material(view, item, part) as usize];
-                    let share = material.clearness();
-                    is_blocked |= share == 0.0;
-                    crossed.push((rank, share));
-                });
-                if is_blocked { Step::Enough } else { Step::On(ray.reach) }
-            });
+            visit::<K>(
+                view,
+                ray,
+                || (),
+                |item| {
+                    between(view, ray, &shear, self.touches, item, &mut scratch, |rank, part| {
+                        let material = &view.materials[material(view, item, part) as usize];
+                        let share = material.clearness();
+                        is_blocked |= share == 0.0;
+                        crossed.push((rank, share));
+                    });
+                    if is_blocked { Step::Enough } else { Step::On(ray.reach) }
+                },
+            );
             // In an order that does not depend on the tree, for products round.
             crossed.sort_unstable_by_key(|&(rank, _)| rank);
             let share = crossed.iter().fold(1.0, |product, (_, share)| product * share);
@@ -157,9 +172,15 @@ enum Step {
     Enough,
 }
 
-/// Calls `meet` for the faces in the leaves that the ray enters, nearer boxes first.
+/// Calls `enter` for the nodes that the ray enters and `meet` for the faces in their leaves, nearer
+/// boxes first.
 #[inline(always)]
-fn visit<K: BoxKernel>(view: &View<'_>, ray: &Ray, mut meet: impl FnMut(Item) -> Step) {
+fn visit<K: BoxKernel>(
+    view: &View<'_>,
+    ray: &Ray,
+    mut enter: impl FnMut(),
+    mut meet: impl FnMut(Item) -> Step,
+) {
     let mut box_ray = BoxRay::new(ray.origin, ray.direction, ray.reach, &view.header.frame);
     let mut stack = [(0.0_f32, Child::NONE); STACK];
     let mut waiting = 0;
@@ -173,6 +194,7 @@ fn visit<K: BoxKernel>(view: &View<'_>, ray: &Ray, mut meet: impl FnMut(Item) ->
                 }
             }
         } else {
+            enter();
             let node = &view.nodes[current.node()];
             let (distances, mut mask) = K::test(node, &box_ray);
             let first = waiting;
@@ -345,19 +367,17 @@ fn between(
             let center = DVec3::from_array(sphere.center);
             let surface = Surface(sphere.surface);
             let is_inner = |&t: &f64| t > 0.0 && t < ray.reach;
-            let ends = if ray.leaving == surface {
-                // Both ends on the sphere: nothing between.
-                let again = hit_sphere_again(ray, center);
-                [again, if touches.contains(&surface) { again } else { f64::INFINITY }]
-            } else if touches.contains(&surface) {
-                let back = Ray { origin: ray.origin + ray.reach * ray.direction, ..*ray };
-                [ray.reach + hit_sphere_again(&back, center), f64::INFINITY]
-            } else {
-                hit_sphere(ray, center, sphere.radius).unwrap_or([f64::INFINITY; 2])
+            let ends = match (ray.leaving == surface, touches.contains(&surface)) {
+                (true, true) => return, // A chord: nothing between its ends.
+                (true, false) => [hit_sphere_again(ray, center), f64::INFINITY],
+                (false, true) => {
+                    let back = Ray { origin: ray.origin + ray.reach * ray.direction, ..*ray };
+                    [ray.reach + hit_sphere_again(&back, center), f64::INFINITY]
+                }
+                (false, false) => {
+                    hit_sphere(ray, center, sphere.radius).unwrap_or([f64::INFINITY; 2])
+                }
             };
-            if ray.leaving == surface && touches.contains(&surface) {
-                return;
-            }
             for _ in ends.iter().filter(|t| is_inner(t)) {
                 cross(sphere.rank, 0);
             }
@@ -422,6 +442,28 @@ impl<B: AsRef<[u8]>> PreparedScene<B> {
         probes.iter().map(&mut try_all).collect()
     }
 
+    /// How many nodes of the hierarchy each probe visits on its way to what it meets first.
+    pub fn count_visits(&self, probes: &[Probe]) -> Vec<u32> {
+        let view = self.view();
+        let mut scratch = Scratch::default();
+        let mut count = |probe: &Probe| {
+            let ray = to_ray(&view, probe);
+            let mut nearest = Nearest::new(&ray);
+            let mut visits = 0;
+            visit::<ScalarBoxes>(
+                &view,
+                &ray,
+                || visits += 1,
+                |item| {
+                    nearest.meet(&view, item, &mut scratch);
+                    Step::On(nearest.hit.t)
+                },
+            );
+            visits
+        };
+        probes.iter().map(&mut count).collect()
+    }
+
     /// How many faces each probe crosses.
     pub fn count_crossings(&self, probes: &[Probe]) -> Vec<u32> {
         let view = self.view();
@@ -430,10 +472,15 @@ impl<B: AsRef<[u8]>> PreparedScene<B> {
             let ray = to_ray(&view, probe);
             let shear = Shear::new(ray.origin, ray.direction);
             let mut crossings = 0;
-            visit::<ScalarBoxes>(&view, &ray, |item| {
-                between(&view, &ray, &shear, &[], item, &mut scratch, |_, _| crossings += 1);
-                Step::On(ray.reach)
-            });
+            visit::<ScalarBoxes>(
+                &view,
+                &ray,
+                || (),
+                |item| {
+                    between(&view, &ray, &shear, &[], item, &mut scratch, |_, _| crossings += 1);
+                    Step::On(ray.reach)
+                },
+            );
             crossings
         };
         probes.iter().map(&mut count).collect()
