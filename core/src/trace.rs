@@ -82,15 +82,10 @@ impl Batch for Trace<'_> {
         let mut scratch = Scratch::default();
         for ray in self.rays {
             let mut nearest = Nearest::new(ray);
-            visit::<K>(
-                view,
-                ray,
-                || (),
-                |item| {
-                    nearest.meet(view, item, &mut scratch);
-                    Step::On(nearest.hit.t)
-                },
-            );
+            visit::<K>(view, ray, |item| {
+                nearest.meet(view, item, &mut scratch);
+                Step::On(nearest.hit.t)
+            });
             self.hits.push(nearest.hit);
         }
     }
@@ -110,17 +105,12 @@ impl Batch for Shadows<'_> {
         for ray in self.rays {
             let shear = Shear::new(ray.origin, ray.direction);
             let mut is_blocked = false;
-            visit::<K>(
-                view,
-                ray,
-                || (),
-                |item| {
-                    between(view, ray, &shear, self.touches, item, &mut scratch, |_, _| {
-                        is_blocked = true;
-                    });
-                    if is_blocked { Step::Enough } else { Step::On(ray.reach) }
-                },
-            );
+            visit::<K>(view, ray, |item| {
+                between(view, ray, &shear, self.touches, item, &mut scratch, |_, _| {
+                    is_blocked = true;
+                });
+                if is_blocked { Step::Enough } else { Step::On(ray.reach) }
+            });
             self.shares.push(if is_blocked { 0.0 } else { 1.0 });
         }
     }
@@ -142,20 +132,15 @@ impl Batch for ClearShadows<'_> {
             let shear = Shear::new(ray.origin, ray.direction);
             crossed.clear();
             let mut is_blocked = false;
-            visit::<K>(
-                view,
-                ray,
-                || (),
-                |item| {
-                    between(view, ray, &shear, self.touches, item, &mut scratch, |rank, part| {
-                        let material = &view.materials[material(view, item, part) as usize];
-                        let share = material.clearness();
-                        is_blocked |= share == 0.0;
-                        crossed.push((rank, share));
-                    });
-                    if is_blocked { Step::Enough } else { Step::On(ray.reach) }
-                },
-            );
+            visit::<K>(view, ray, |item| {
+                between(view, ray, &shear, self.touches, item, &mut scratch, |rank, part| {
+                    let material = &view.materials[material(view, item, part) as usize];
+                    let share = material.clearness();
+                    is_blocked |= share == 0.0;
+                    crossed.push((rank, share));
+                });
+                if is_blocked { Step::Enough } else { Step::On(ray.reach) }
+            });
             // In an order that does not depend on the tree, for products round.
             crossed.sort_unstable_by_key(|&(rank, _)| rank);
             let share = crossed.iter().fold(1.0, |product, (_, share)| product * share);
@@ -172,10 +157,15 @@ enum Step {
     Enough,
 }
 
-/// Calls `enter` for the nodes that the ray enters and `meet` for the faces in their leaves, nearer
-/// boxes first.
+/// Calls `meet` for the faces in the leaves that the ray enters, nearer boxes first.
 #[inline(always)]
-fn visit<K: BoxKernel>(
+fn visit<K: BoxKernel>(view: &View<'_>, ray: &Ray, meet: impl FnMut(Item) -> Step) {
+    visit_nodes::<K>(view, ray, || (), meet);
+}
+
+/// The same, and calls `enter` for each node.
+#[inline(always)]
+fn visit_nodes<K: BoxKernel>(
     view: &View<'_>,
     ray: &Ray,
     mut enter: impl FnMut(),
@@ -450,7 +440,7 @@ impl<B: AsRef<[u8]>> PreparedScene<B> {
             let ray = to_ray(&view, probe);
             let mut nearest = Nearest::new(&ray);
             let mut visits = 0;
-            visit::<ScalarBoxes>(
+            visit_nodes::<ScalarBoxes>(
                 &view,
                 &ray,
                 || visits += 1,
@@ -472,15 +462,10 @@ impl<B: AsRef<[u8]>> PreparedScene<B> {
             let ray = to_ray(&view, probe);
             let shear = Shear::new(ray.origin, ray.direction);
             let mut crossings = 0;
-            visit::<ScalarBoxes>(
-                &view,
-                &ray,
-                || (),
-                |item| {
-                    between(&view, &ray, &shear, &[], item, &mut scratch, |_, _| crossings += 1);
-                    Step::On(ray.reach)
-                },
-            );
+            visit::<ScalarBoxes>(&view, &ray, |item| {
+                between(&view, &ray, &shear, &[], item, &mut scratch, |_, _| crossings += 1);
+                Step::On(ray.reach)
+            });
             crossings
         };
         probes.iter().map(&mut count).collect()
