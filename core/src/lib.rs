@@ -43,3 +43,4 @@ mod sphere;
 pub mod tile;
 pub mod trace;
 mod triangle;
+mod wavefront;

@@ -1,10 +1,8 @@
 //! A tile of a prepared scene into pixels.
 //!
-//! Rays travel in batches, class by class: a batch's camera rays are traced together, then the
-//! shadow rays towards each light in turn, then all mirrored and transmitted rays of the next
-//! depth, and so on. What a sample receives is added in one order of depths and lights, and a
-//! pixel's samples in their own order, so a pixel is a pure function of (scene, settings, pixel):
-//! the same to the bit whatever the tile, the batch, the thread or the CPU.
+//! A pixel's samples are added in their own order, and each is a pure function of (scene,
+//! settings, pixel, sample): a pixel is the same to the bit whatever the tile, the batch, the
+//! thread or the CPU.
 
 use std::ops::ControlFlow;
 
@@ -12,12 +10,10 @@ use glam::DVec3;
 
 use crate::{
     isa::Isa,
-    prepared::{Camera, PlaneIndex, PreparedScene, View},
-    ray::{Hit, Kind, Ray, Surface},
+    prepared::PreparedScene,
     sample::Samples,
     tile::{Area, Size},
-    trace::{self, trace, trace_shadows},
-    triangle::triangle_normal,
+    wavefront::{Batch, CameraSample},
 };
 
 /// What a picture depends on besides the scene.
@@ -38,9 +34,6 @@ pub struct Settings {
 
 /// The cut-off where nobody chose one: a sixteenth of an 8-bit step.
 pub const DEFAULT_CUTOFF: f64 = 1.0 / 4096.0;
-
-/// The depth of the last rays that are traced; camera rays have depth 0.
-pub const DEEPEST: u32 = 64;
 
 /// A rendered tile.
 #[derive(Debug, Clone, PartialEq)]
@@ -75,7 +68,13 @@ pub fn render_tile<B: AsRef<[u8]>>(
     let mut first = 0;
     while first < sample_count {
         let last = sample_count.min(first + BATCH as u64);
-        batch.start(&view.header.camera, settings, area, first..last);
+        let wanted = (first..last).map(|index| {
+            let pixel = (index / samples) as u32;
+            let (x, y) = (area.x0 + pixel % area.width, area.y0 + pixel / area.width);
+            let of_pixel = Samples::new(settings.samples, settings.seed, x, y);
+            CameraSample { x, y, sample: of_pixel.sample((index % samples) as u32) }
+        });
+        batch.start(&view.header.camera, settings, wanted);
         match batch.run(&view, settings, isa, on_progress) {
             ControlFlow::Continue(count) => rays += count,
             ControlFlow::Break(()) => return None,
@@ -89,282 +88,4 @@ pub fn render_tile<B: AsRef<[u8]>>(
     let count = f64::from(settings.samples);
     let pixels = sums.into_iter().map(|sum| (sum / count).to_array().map(|x| x as f32)).collect();
     Some(RenderedTile { pixels, rays, cut })
-}
-
-/// Samples on their way, and the queues that they pass through.
-#[derive(Default)]
-struct Batch {
-    /// The rays of the current depth, and what each adds to.
-    rays: Vec<Ray>,
-    branches: Vec<Branch>,
-    hits: Vec<Hit>,
-    points: Vec<Point>,
-    shadow_rays: Vec<Ray>,
-    /// For each shadow ray, its point and what arrives if nothing is in its way.
-    arrivals: Vec<(usize, DVec3)>,
-    shares: Vec<f64>,
-    next_rays: Vec<Ray>,
-    next_branches: Vec<Branch>,
-    /// What each sample sees.
-    colors: Vec<DVec3>,
-    /// Of each sample, the weights of the branches that were not traced.
-    cut: Vec<f64>,
-}
-
-/// A ray of the tree that a camera ray grows into.
-#[derive(Clone, Copy)]
-struct Branch {
-    sample: usize,
-    /// The product of the factors on the way from the sample.
-    weight: f64,
-}
-
-/// A place on a surface that a ray sees.
-struct Point {
-    sample: usize,
-    /// What the surface's own light counts in the sample.
-    weight: f64,
-    position: DVec3,
-    /// Of length 1, towards the side that is seen.
-    normal: DVec3,
-    surface: Surface,
-    color: DVec3,
-    /// The light received so far.
-    light: DVec3,
-}
-
-impl Batch {
-    /// Queues the camera rays of the samples `range` of `area`: pixel by pixel, row by row.
-    fn start(
-        &mut self,
-        camera: &Camera,
-        settings: &Settings,
-        area: Area,
-        range: std::ops::Range<u64>,
-    ) {
-        self.rays.clear();
-        let size = settings.size;
-        let screen = [camera.top_left, camera.right, camera.down].map(DVec3::from_array);
-        let mut current = None;
-        for index in range {
-            let pixel = (index / u64::from(settings.samples)) as u32;
-            let sample = (index % u64::from(settings.samples)) as u32;
-            let (x, y) = (area.x0 + pixel % area.width, area.y0 + pixel / area.width);
-            let samples = match current {
-                Some((of, samples)) if of == pixel => samples,
-                _ => Samples::new(settings.samples, settings.seed, x, y),
-            };
-            current = Some((pixel, samples));
-            let [across, down] = samples.position(sample);
-            let u = (f64::from(x) + across) / f64::from(size.width());
-            let v = (f64::from(y) + down) / f64::from(size.height());
-            let direction = screen[0] + u * screen[1] + v * screen[2];
-            self.rays.push(Ray {
-                origin: DVec3::from_array(camera.eye),
-                direction: direction / direction.length(),
-                reach: f64::INFINITY,
-                leaving: Surface::NONE,
-                after: Ray::NOTHING_AHEAD,
-            });
-        }
-        self.branches.clear();
-        self.branches.extend((0..self.rays.len()).map(|sample| Branch { sample, weight: 1.0 }));
-        self.colors.clear();
-        self.colors.resize(self.rays.len(), DVec3::ZERO);
-        self.cut.clear();
-        self.cut.resize(self.rays.len(), 0.0);
-    }
-
-    /// Finds what every queued sample sees; how many rays that took. What is seen at one depth is
-    /// added before what is seen at the next, and there a mirror's before the light behind it, so
-    /// a sample's sum has one order whatever else is in the batch.
-    fn run(
-        &mut self,
-        view: &View<'_>,
-        settings: &Settings,
-        isa: Isa,
-        on_progress: &mut dyn FnMut() -> ControlFlow<()>,
-    ) -> ControlFlow<(), u64> {
-        let background = DVec3::from_array(view.header.lighting.background);
-        let mut ray_count = 0;
-        let mut depth = 0;
-        while !self.rays.is_empty() {
-            on_progress()?;
-            trace(view, isa, &self.rays, &mut self.hits);
-            ray_count += self.rays.len() as u64;
-            self.points.clear();
-            self.next_rays.clear();
-            self.next_branches.clear();
-            for index in 0..self.rays.len() {
-                let (ray, hit, branch) = (self.rays[index], self.hits[index], self.branches[index]);
-                if hit.is_some() {
-                    self.meet(view, &ray, &hit, branch, settings.cutoff, depth);
-                } else {
-                    self.colors[branch.sample] += branch.weight * background;
-                }
-            }
-            ray_count += self.light_points(view, settings.flat, isa);
-            for point in &self.points {
-                self.colors[point.sample] += point.weight * (point.color * point.light);
-            }
-            std::mem::swap(&mut self.rays, &mut self.next_rays);
-            std::mem::swap(&mut self.branches, &mut self.next_branches);
-            depth += 1;
-        }
-        for (color, cut) in self.colors.iter_mut().zip(&self.cut) {
-            *color += *cut * background;
-        }
-        ControlFlow::Continue(ray_count)
-    }
-
-    /// A ray has met a face: queues what its own light and its branches need.
-    fn meet(
-        &mut self,
-        view: &View<'_>,
-        ray: &Ray,
-        hit: &Hit,
-        Branch { sample, weight }: Branch,
-        cutoff: f64,
-        depth: u32,
-    ) {
-        let position = ray.origin + hit.t * ray.direction;
-        let outward = face_normal(view, hit, position);
-        let is_front = outward.dot(ray.direction) <= 0.0;
-        let normal = if is_front { outward } else { -outward };
-        let surface = trace::surface(view, hit.item, hit.part);
-        let material = &view.materials[trace::material(view, hit.item, hit.part) as usize];
-        let (reflect, alpha) = (material.reflect, material.alpha);
-        if reflect < 1.0 && alpha > 0.0 {
-            self.points.push(Point {
-                sample,
-                weight: weight * ((1.0 - reflect) * alpha),
-                position,
-                normal,
-                surface,
-                color: DVec3::from_array(material.color),
-                light: DVec3::from_array(view.header.lighting.ambient),
-            });
-        }
-        if view.header.features.has_branches == 0 {
-            return;
-        }
-        let mut follow = |direction: DVec3, after: u32, weight: f64| {
-            if weight < cutoff || depth == DEEPEST {
-                self.cut[sample] += weight;
-                return;
-            }
-            self.next_rays.push(Ray {
-                origin: position,
-                direction,
-                reach: f64::INFINITY,
-                leaving: surface,
-                after,
-            });
-            self.next_branches.push(Branch { sample, weight });
-        };
-        let cosine = -normal.dot(ray.direction);
-        let mirrored = mirror(ray.direction, normal, cosine);
-        if reflect > 0.0 {
-            follow(mirrored, Ray::NOTHING_AHEAD, weight * reflect);
-        }
-        if reflect < 1.0 && alpha < 1.0 {
-            let weight = weight * ((1.0 - reflect) * (1.0 - alpha));
-            let ratio = if is_front { material.refract } else { 1.0 / material.refract };
-            let is_straight = material.refract == 0.0 || material.refract == 1.0;
-            let bent = if is_straight {
-                Some(ray.direction)
-            } else {
-                refract(ray.direction, normal, cosine, ratio)
-            };
-            match bent {
-                Some(direction) => follow(direction, hit.rank, weight),
-                None => follow(mirrored, Ray::NOTHING_AHEAD, weight), // Total reflection.
-            }
-        }
-    }
-
-    /// Finds the light that the points receive; how many rays that took.
-    fn light_points(&mut self, view: &View<'_>, flat: bool, isa: Isa) -> u64 {
-        if flat || view.header.features.is_lit == 0 {
-            self.points.iter_mut().for_each(|point| point.light = DVec3::ONE);
-            return 0;
-        }
-        (0..view.lights.len()).map(|index| self.light(view, index, isa)).sum()
-    }
-
-    /// Adds what light `index` gives each point; how many rays that took.
-    fn light(&mut self, view: &View<'_>, index: usize, isa: Isa) -> u64 {
-        let light = &view.lights[index];
-        let [position, intensity] = [light.position, light.intensity].map(DVec3::from_array);
-        let touches = view.touches(light);
-        self.shadow_rays.clear();
-        self.arrivals.clear();
-        for (k, point) in self.points.iter().enumerate() {
-            let to_light = position - point.position;
-            let height = point.normal.dot(to_light);
-            // Where the light is on the surface the height is rounding, but the distance may be
-            // as small.
-            if height > 0.0 && !touches.contains(&point.surface) {
-                let distance = to_light.length();
-                self.arrivals.push((k, intensity * (height / (distance * distance * distance))));
-                self.shadow_rays.push(Ray {
-                    origin: point.position,
-                    direction: to_light / distance,
-                    reach: distance,
-                    leaving: point.surface,
-                    after: Ray::NOTHING_AHEAD,
-                });
-            }
-        }
-        trace_shadows(view, isa, light, &self.shadow_rays, &mut self.shares);
-        for (&(point, arrival), &share) in self.arrivals.iter().zip(&self.shares) {
-            self.points[point].light += share * arrival;
-        }
-        self.shadow_rays.len() as u64
-    }
-}
-
-/// The direction of mirrored light; `cosine` is that between the normal and where it came from.
-fn mirror(direction: DVec3, normal: DVec3, cosine: f64) -> DVec3 {
-    let mirrored = direction + 2.0 * cosine * normal;
-    mirrored / mirrored.length()
-}
-
-/// The direction of light behind a face by Snell's law with n1/n2 = `ratio`; `None` on total
-/// reflection. The sine is taken as (1 - c)(1 + c), which keeps its digits near the normal.
-fn refract(direction: DVec3, normal: DVec3, cosine: f64, ratio: f64) -> Option<DVec3> {
-    let square = 1.0 - ratio * ratio * ((1.0 - cosine) * (1.0 + cosine));
-    (square >= 0.0).then(|| {
-        let bent = ratio * direction + (ratio * cosine - square.sqrt()) * normal;
-        bent / bent.length()
-    })
-}
-
-/// The unit normal towards the front of what a ray hit.
-fn face_normal(view: &View<'_>, hit: &Hit, position: DVec3) -> DVec3 {
-    let of_plane =
-        |plane: PlaneIndex| DVec3::from_array(view.planes[plane.index()].normal) * plane.sign();
-    let of_sphere = |center: [f64; 3]| {
-        let outward = position - DVec3::from_array(center);
-        outward / outward.length()
-    };
-    let index = hit.item.index();
-    match hit.item.kind().expect("a checked item") {
-        Kind::Triangle => {
-            let corners = view.corners(&view.triangles[index].vertices);
-            triangle_normal(corners.map(|&corner| DVec3::from_array(corner)))
-        }
-        Kind::Coplanar => of_plane(view.coplanars[index].plane),
-        Kind::Quadrangle => of_plane(view.quadrangles[index].plane),
-        Kind::Sphere => of_sphere(view.spheres[index].center),
-        Kind::Solid => {
-            let leaf = &view.solid_leaves(&view.solids[index])[hit.part as usize / 6];
-            let outward = if leaf.is_sphere() {
-                of_sphere(leaf.center)
-            } else {
-                of_plane(leaf.planes[hit.part as usize % 6])
-            };
-            if leaf.is_turned == 1 { -outward } else { outward }
-        }
-    }
 }

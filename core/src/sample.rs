@@ -3,30 +3,63 @@
 /// The most samples that a pixel may have.
 pub const MOST_SAMPLES: u32 = 1 << 16;
 
-/// The sample positions of one pixel, a pure function of (seed, pixel, sample).
+/// Independent runs of samples in a pixel: how far their means lie apart tells the pixel's error.
+pub const RUNS: u32 = 4;
+
+/// The fewest samples of a pixel whose error is estimated: two in each run.
+pub const FEWEST_FOR_ERROR: u32 = 2 * RUNS;
+
+/// The samples of one pixel, a pure function of (seed, pixel, sample).
 ///
-/// One sample alone lies in the pixel's middle. More are points of the Sobol sequence, scrambled
-/// anew in every pixel. Source: Burley, "Practical Hash-based Owen Scrambling" (2020).
+/// One sample alone lies in the pixel's middle. Up to seven are points of the Sobol sequence,
+/// scrambled anew in every pixel. More are dealt out to [`RUNS`] sequences, each scrambled
+/// independently. Source: Burley, "Practical Hash-based Owen Scrambling" (2020).
 #[derive(Debug, Clone, Copy)]
 pub struct Samples {
     count: u32,
-    scramble: u32,
+    key: u64,
 }
 
 impl Samples {
-    /// The samples of pixel (x, y).
+    /// The samples of pixel (x, y) where it has `count` of them or, if that is at least
+    /// [`FEWEST_FOR_ERROR`], the first of any larger number.
     pub fn new(count: u32, seed: u64, x: u32, y: u32) -> Self {
         let pixel = u64::from(y) << 32 | u64::from(x);
-        Self { count, scramble: (mix(mix(seed) ^ pixel) >> 32) as u32 }
+        Self { count, key: mix(mix(seed) ^ pixel) }
     }
 
-    /// A sample's place across and down its pixel, each in `0..1`.
-    pub fn position(&self, sample: u32) -> [f64; 2] {
-        if self.count == 1 {
+    /// The sample of a number below [`MOST_SAMPLES`].
+    pub fn sample(&self, number: u32) -> Sample {
+        if self.count < FEWEST_FOR_ERROR {
+            return Sample { index: number, key: self.key, is_alone: self.count == 1 };
+        }
+        let key = mix(self.key ^ u64::from(number % RUNS));
+        Sample { index: number / RUNS, key, is_alone: false }
+    }
+}
+
+/// The random numbers of one sample.
+#[derive(Debug, Clone, Copy)]
+pub struct Sample {
+    /// The place in its sequence.
+    index: u32,
+    key: u64,
+    is_alone: bool,
+}
+
+impl Sample {
+    /// Its place across and down the pixel, each in `0..1`.
+    pub fn position(&self) -> [f64; 2] {
+        if self.is_alone {
             return [0.5; 2];
         }
-        [0, 1].map(|dimension| {
-            f64::from(sobol_burley::sample(sample % MOST_SAMPLES, dimension, self.scramble))
+        self.numbers(0, self.key)
+    }
+
+    fn numbers<const N: usize>(&self, first_dimension: u32, key: u64) -> [f64; N] {
+        let scramble = (key >> 32) as u32;
+        std::array::from_fn(|k| {
+            f64::from(sobol_burley::sample(self.index, first_dimension + k as u32, scramble))
         })
     }
 }
@@ -45,21 +78,23 @@ mod tests {
     use super::*;
 
     #[test]
-    fn sixteen_samples_lie_in_sixteen_cells() {
+    fn sixteen_samples_of_a_run_lie_in_sixteen_cells() {
         for pixel in 0..100 {
-            let samples = Samples::new(16, 7, pixel, 3);
-            let mut cells = [0; 16];
-            for sample in 0..16 {
-                let [x, y] = samples.position(sample);
-                cells[(x * 4.0) as usize * 4 + (y * 4.0) as usize] += 1;
+            let samples = Samples::new(64, 7, pixel, 3);
+            for run in 0..RUNS {
+                let mut cells = [0; 16];
+                for number in 0..16 {
+                    let [x, y] = samples.sample(number * RUNS + run).position();
+                    cells[(x * 4.0) as usize * 4 + (y * 4.0) as usize] += 1;
+                }
+                assert_eq!(cells, [1; 16], "pixel {pixel}, run {run}");
             }
-            assert_eq!(cells, [1; 16], "pixel {pixel}");
         }
     }
 
     #[test]
     fn pixels_and_seeds_have_samples_of_their_own() {
-        let first = |seed, x, y| Samples::new(16, seed, x, y).position(0);
+        let first = |seed, x, y| Samples::new(16, seed, x, y).sample(0).position();
         assert_ne!(first(0, 1, 2), first(0, 2, 1));
         assert_ne!(first(0, 1, 2), first(1, 1, 2));
         assert_eq!(first(5, 1, 2), first(5, 1, 2));

@@ -166,7 +166,7 @@ fn check_arrival(what: &str, glass: &str, geometry: &str, x: f64, expect: impl F
     );
     let settings = settings(1, 1, 1);
     let bare = read(&viewport).viewport.unwrap();
-    let at = Samples::new(1, settings.seed, 0, 0).position(0);
+    let at = Samples::new(1, settings.seed, 0, 0).sample(0).position();
     let direction = eye_direction(&bare, settings.size, at[0], at[1]).normalize();
     let target = expect(direction);
     // Aside, so that the light grows as the ray comes nearer.

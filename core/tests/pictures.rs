@@ -28,7 +28,7 @@ const ROUNDING: f64 = 1e-6;
 
 fn positions(settings: &Settings, x: u32, y: u32) -> Vec<(f64, f64)> {
     let samples = Samples::new(settings.samples, settings.seed, x, y);
-    (0..settings.samples).map(|k| samples.position(k).into()).collect()
+    (0..settings.samples).map(|k| samples.sample(k).position().into()).collect()
 }
 
 fn is_same(found: [f32; 3], truth: [f64; 3]) -> bool {
