@@ -61,7 +61,11 @@ fn parallel_mirrors_add_up_a_geometric_series_and_report_the_rest() {
             rest *= share;
             depth += 1;
         }
-        assert!((tile.cut - rest).abs() < 1e-14, "{share}: {} cut, truly {rest}", tile.cut);
+        assert!(
+            (tile.tally.cut - rest).abs() < 1e-14,
+            "{share}: {} cut, truly {rest}",
+            tile.tally.cut
+        );
         for pixel in tile.pixels {
             let error = (f64::from(pixel[0]) - (1.0 - rest)).abs();
             assert!(error < 1e-7, "{share}: {pixel:?}, truly {}", 1.0 - rest);
@@ -166,7 +170,7 @@ fn check_arrival(what: &str, glass: &str, geometry: &str, x: f64, expect: impl F
     );
     let settings = settings(1, 1, 1);
     let bare = read(&viewport).viewport.unwrap();
-    let at = Samples::new(1, settings.seed, 0, 0).sample(0).position();
+    let at = Samples::new(1, settings.quality.seed, 0, 0).sample(0).position();
     let direction = eye_direction(&bare, settings.size, at[0], at[1]).normalize();
     let target = expect(direction);
     // Aside, so that the light grows as the ray comes nearer.

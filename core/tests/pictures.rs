@@ -8,7 +8,7 @@ use std::{fs, path::Path};
 use glam::{DVec2, DVec3};
 use rtfarm_core::{
     prepared::{PreparedBytes, PreparedScene},
-    render::{DEFAULT_CUTOFF, Settings},
+    render::{Sampling, Settings},
     sample::Samples,
     scene::{Scene, Viewport},
     tile::{Area, Size},
@@ -21,14 +21,15 @@ use rtfarm_oracle::{
     random_scene::{Recipe, Style, random_scene},
     reference_picture,
 };
-use studio::{picture, pixels, prepared, read, settings, whole};
+use studio::{picture, pixels, prepared, quality, read, settings, whole};
 
 /// The channels are rounded to f32 once, at the end; 1.0 is what a scene writes as 255.
 const ROUNDING: f64 = 1e-6;
 
 fn positions(settings: &Settings, x: u32, y: u32) -> Vec<(f64, f64)> {
-    let samples = Samples::new(settings.samples, settings.seed, x, y);
-    (0..settings.samples).map(|k| samples.sample(k).position().into()).collect()
+    let Sampling::Fixed(count) = settings.quality.sampling else { panic!("fixed sampling") };
+    let samples = Samples::new(count, settings.quality.seed, x, y);
+    (0..count).map(|k| samples.sample(k).position().into()).collect()
 }
 
 fn is_same(found: [f32; 3], truth: [f64; 3]) -> bool {
@@ -55,7 +56,8 @@ fn pixel_margin(oracle: &Oracle, scene: &Scene, settings: &Settings, x: u32, y: 
 /// rounding decides; tells how many there are.
 fn check_against_oracle(what: &str, scene: &Scene, settings: &Settings) -> usize {
     let found = picture(scene, settings);
-    let oracle_settings = OracleSettings { flat: settings.flat, ..OracleSettings::default() };
+    let oracle_settings =
+        OracleSettings { flat: settings.quality.flat, ..OracleSettings::default() };
     let of_pixel = |x, y| positions(settings, x, y);
     let truth = reference_picture(scene, settings.size, &of_pixel, &oracle_settings);
     let oracle = Oracle::new(scene);
@@ -180,7 +182,7 @@ fn check_coverage(
     let scene = prepared(scene);
     let mut errors = Vec::new();
     for samples in [16, 64, 256, 1024] {
-        let settings = Settings { size, samples, seed: 3, flat: false, cutoff: DEFAULT_CUTOFF };
+        let settings = Settings { size, quality: quality(samples, 3) };
         let side = f64::from(samples).sqrt();
         let (mut squares, mut edge_count, mut sum, mut worst) = (0.0, 0, 0.0, 0.0_f64);
         for (k, pixel) in (0..).zip(pixels(&scene, &settings, whole(size))) {
