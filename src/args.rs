@@ -7,7 +7,7 @@ use rtfarm_coordinator::Wish;
 use rtfarm_core::{
     isa::{Isa, IsaError},
     picture::PictureFormat,
-    render::DEFAULT_CUTOFF,
+    render::{DEFAULT_CUTOFF, DEFAULT_ERROR, DEFAULT_MOST_SAMPLES, Quality, Sampling},
     tile::{Size, SizeError, TileGrid},
 };
 use rtfarm_proto::Address;
@@ -83,9 +83,18 @@ pub(crate) struct PictureArgs {
     #[arg(long, value_name = "WxH", value_parser = parse_size)]
     size: Option<Size>,
 
-    /// Samples in every pixel.
-    #[arg(long, value_name = "N", default_value_t = 16, value_parser = value_parser!(u32).range(1..=65_536))]
-    samples: u32,
+    /// The same number of samples in every pixel.
+    #[arg(long, value_name = "N", value_parser = value_parser!(u32).range(1..=65_536), conflicts_with_all = ["error", "max_samples"])]
+    samples: Option<u32>,
+
+    /// Sample each pixel until its standard error is below this, where 1 is full light. Default:
+    /// 1/255, an 8-bit step.
+    #[arg(long, value_name = "ERROR", default_value_t = DEFAULT_ERROR, hide_default_value = true, value_parser = parse_error)]
+    error: f64,
+
+    /// But at most so often.
+    #[arg(long, value_name = "N", default_value_t = DEFAULT_MOST_SAMPLES, value_parser = value_parser!(u32).range(8..=65_536))]
+    max_samples: u32,
 
     /// Chooses the random numbers.
     #[arg(long, value_name = "N", default_value_t = 0)]
@@ -99,6 +108,10 @@ pub(crate) struct PictureArgs {
     /// background.
     #[arg(long, value_name = "WEIGHT", default_value_t = DEFAULT_CUTOFF, value_parser = parse_share)]
     cutoff: f64,
+
+    /// Whether surfaces that mirror light others.
+    #[arg(long, value_name = "on|off", default_value = "on", hide_possible_values = true)]
+    secondary: Switch,
 
     /// The side of a tile in pixels; by default the one that gives about 1000 tiles.
     #[arg(long, value_name = "N", value_parser = value_parser!(u64).range(TileGrid::SIDES))]
@@ -204,6 +217,15 @@ pub(crate) struct SubmitArgs {
     pub(crate) log_format: LogFormat,
 }
 
+/// Yes or no.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum Switch {
+    /// Yes.
+    On,
+    /// No.
+    Off,
+}
+
 /// How log lines are written.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub(crate) enum LogFormat {
@@ -246,10 +268,16 @@ impl PictureArgs {
             name: self.scene.name(),
             strict: self.scene.strict,
             size: self.size,
-            samples: self.samples,
-            seed: self.seed,
-            flat: self.flat,
-            cutoff: self.cutoff,
+            quality: Quality {
+                sampling: match self.samples {
+                    Some(count) => Sampling::Fixed(count),
+                    None => Sampling::Adaptive { error: self.error, most: self.max_samples },
+                },
+                seed: self.seed,
+                flat: self.flat,
+                secondary: matches!(self.secondary, Switch::On),
+                cutoff: self.cutoff,
+            },
             tile_side: self.tile,
             format,
         }
@@ -294,6 +322,15 @@ fn parse_size(text: &str) -> Result<Size, String> {
     let sides = text.split_once('x').and_then(|(w, h)| Some((w.parse().ok()?, h.parse().ok()?)));
     let (width, height) = sides.ok_or("a size looks like 1280x720")?;
     Size::new(width, height).map_err(|error: SizeError| error.to_string())
+}
+
+fn parse_error(text: &str) -> Result<f64, String> {
+    let error: f64 = text.parse().map_err(|_| "a number is wanted")?;
+    if Sampling::is_error(error) {
+        Ok(error)
+    } else {
+        Err("an error is above 0 and at most 1".to_owned())
+    }
 }
 
 fn parse_share(text: &str) -> Result<f64, String> {

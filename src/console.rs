@@ -106,7 +106,7 @@ impl Bar {
             let seconds = self.start.elapsed().as_secs_f64();
             let tiles_left = f64::from(progress.tile_count - progress.tiles_done);
             let left = seconds / f64::from(progress.tiles_done) * tiles_left;
-            let mrays = progress.rays as f64 / 1e6 / seconds;
+            let mrays = progress.tally.rays as f64 / 1e6 / seconds;
             bar.set_message(format!("{mrays:.1} Mrays/s  {left:.0} s left"));
         }
     }

@@ -60,11 +60,10 @@ pub(crate) fn render(
             let mut done = 0;
             progress.send_modify(|progress| {
                 progress.tiles_done += 1;
-                progress.rays += rendered.rays;
-                progress.cut = progress.cut.max(rendered.cut);
+                progress.tally.add(&rendered.tally);
                 done = progress.tiles_done;
             });
-            let cost = TileCost { seconds, rays: rendered.rays };
+            let cost = TileCost { seconds, rays: rendered.tally.rays };
             log_tile(done, grid.count(), tile, WorkerId(0), &cost, started.elapsed());
         }
     });

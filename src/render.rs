@@ -13,7 +13,12 @@ use anyhow::{Context, anyhow};
 use rtfarm_coordinator::{
     Config, Coordinator, End, Job, Listener, Order, Progress, Refusal, folder_of,
 };
-use rtfarm_core::{picture::Picture, read::draw_diagnostics, tile::Size};
+use rtfarm_core::{
+    picture::Picture,
+    read::draw_diagnostics,
+    render::{Sampling, Tally},
+    tile::Size,
+};
 use rtfarm_proto::Address;
 use tempfile::TempDir;
 use tokio::{net::UnixListener, sync::watch, task::spawn_blocking, time::Instant};
@@ -33,9 +38,8 @@ use crate::{
 #[derive(Debug)]
 pub(crate) struct Summary {
     pub(crate) size: Size,
-    pub(crate) rays: u64,
-    /// The largest share of a sample that was not traced.
-    pub(crate) cut: f64,
+    pub(crate) tally: Tally,
+    pub(crate) sampling: Sampling,
     /// From the first lease to the last tile.
     pub(crate) rendering: Duration,
     pub(crate) workers: usize,
@@ -44,24 +48,41 @@ pub(crate) struct Summary {
 impl Summary {
     /// What there is to say of branches that were not traced.
     fn cut_text(&self) -> String {
-        if self.cut > 0.0 {
-            format!(", at most {:.2} % of a sample cut off", 100.0 * self.cut)
+        if self.tally.cut > 0.0 {
+            format!(", at most {:.2} % of a sample cut off", 100.0 * self.tally.cut)
         } else {
             String::new()
         }
     }
 
+    /// How far off the picture may be.
+    fn error_text(&self) -> String {
+        let Tally { capped, .. } = self.tally;
+        let Some(error) = self.tally.error() else {
+            return "error not estimated".to_owned();
+        };
+        let capped = match self.sampling {
+            Sampling::Adaptive { most, .. } if capped > 0 => {
+                format!(" ({capped} pixels wanted more than {most} samples)")
+            }
+            _ => String::new(),
+        };
+        format!("error {error:.2e}{capped}")
+    }
+
     /// Writes the one line that a render ends with.
     pub(crate) fn tell(&self, started: Instant, output: &Output) -> anyhow::Result<()> {
-        let mrays = self.rays as f64 / 1e6;
+        let mrays = self.tally.rays as f64 / 1e6;
         writeln!(
             io::stdout().lock(),
-            "{size} in {seconds:.2} s, {mrays:.1} Mrays, {rate:.1} Mrays/s, {workers} {noun}{cut}: {path}",
+            "{size} in {seconds:.2} s, {mrays:.1} Mrays, {rate:.1} Mrays/s, {workers} {noun}, {samples:.1} samples a pixel, {error}{cut}: {path}",
             size = self.size,
             seconds = started.elapsed().as_secs_f64(),
             rate = mrays / self.rendering.as_secs_f64().max(1e-9),
             workers = self.workers,
             noun = if self.workers == 1 { "worker" } else { "workers" },
+            samples = self.tally.samples as f64 / self.size.pixel_count() as f64,
+            error = self.error_text(),
             cut = self.cut_text(),
             path = output.name().display()
         )
@@ -153,7 +174,7 @@ async fn render_here(
     console: &Console,
     stop: &CancellationToken,
 ) -> Result<Summary, Failure> {
-    let size = order.settings.size;
+    let (size, sampling) = (order.settings.size, order.settings.quality.sampling);
     let tile_count = order.grid.count();
     let progress = watch::Sender::new(Progress { tile_count, ..Progress::default() });
     let mut shown = progress.subscribe();
@@ -162,8 +183,8 @@ async fn render_here(
         let (folder, isa, stop) = (output.folder(), args.isa.0, stop.clone());
         move || {
             let rendered = local::render(order, &folder, (threads, isa), &progress, &stop);
-            let (rays, cut) = (progress.borrow().rays, progress.borrow().cut);
-            rendered.map(|rendered| (rendered, rays, cut))
+            let tally = progress.borrow().tally;
+            rendered.map(|rendered| (rendered, tally))
         }
     });
     let show = async {
@@ -173,11 +194,11 @@ async fn render_here(
     };
     let (rendered, ()) = tokio::join!(rendering, show);
     drop(bar);
-    let (Some((picture, rendering)), rays, cut) = rendered?? else {
+    let (Some((picture, rendering)), tally) = rendered?? else {
         return Err(Failure::Interrupted);
     };
     write_picture(output, stop, move |write| write(&picture)).await?;
-    Ok(Summary { size, rays, cut, rendering, workers: 0 })
+    Ok(Summary { size, tally, sampling, rendering, workers: 0 })
 }
 
 async fn render_with_workers(
@@ -188,6 +209,7 @@ async fn render_with_workers(
     console: &Console,
     stop: &CancellationToken,
 ) -> Result<Summary, Failure> {
+    let sampling = order.settings.quality.sampling;
     let folder = private_folder(&std::env::temp_dir())?;
     let socket = folder.path().join("socket");
     let listener = UnixListener::bind(&socket)
@@ -240,8 +262,8 @@ async fn render_with_workers(
     stop_serving.cancel();
     serving.await??;
     let progress = job.progress();
-    let (rays, cut) = (progress.borrow().rays, progress.borrow().cut);
-    Ok(Summary { size: job.picture().size(), rays, cut, rendering: written?, workers })
+    let tally = progress.borrow().tally;
+    Ok(Summary { size: job.picture().size(), tally, sampling, rendering: written?, workers })
 }
 
 /// A folder that only this user can look into; it goes when the answer does.

@@ -70,8 +70,10 @@ pub(crate) async fn run(
     let _ = tokio::time::timeout(DEADLINE, cancelled).await;
     let size = Size::try_from(submitted.frame.context("the coordinator names no size")?)?;
     let (event, rendering) = rendered?;
-    let (rays, cut, workers) = (event.rays, event.cut, event.workers as usize);
-    Summary { size, rays, cut, rendering, workers }.tell(started, &output)?;
+    let tally = event.tally.unwrap_or_default().try_into()?;
+    let workers = event.workers as usize;
+    let sampling = args.picture.wish(output.format()).quality.sampling;
+    Summary { size, tally, sampling, rendering, workers }.tell(started, &output)?;
     Ok(())
 }
 
@@ -88,11 +90,8 @@ async fn submit(
         protocol: PROTOCOL,
         name: wish.name.clone(),
         frame: wish.size.map(Into::into),
-        samples: wish.samples,
-        seed: wish.seed,
-        flat: wish.flat,
+        quality: Some(wish.quality.into()),
         strict: wish.strict,
-        cutoff: wish.cutoff,
         tile_side: wish.tile_side.map_or(0, |side| side as u32),
         format: wire::Format::from(wish.format).into(),
     };
@@ -159,7 +158,7 @@ async fn watch(
         bar.get_or_insert_with(|| console.start_bar(event.tile_count)).show(&Progress {
             tiles_done: event.tiles_done,
             tile_count: event.tile_count,
-            rays: event.rays,
+            tally: event.tally.and_then(|tally| tally.try_into().ok()).unwrap_or_default(),
             ..Progress::default()
         });
         tracing::debug!(done = event.tiles_done, count = event.tile_count, "progress");

@@ -19,7 +19,7 @@ use rtfarm_core::{
     prepare::prepare,
     prepared::PreparedScene,
     read::read_scene,
-    render::{DEFAULT_CUTOFF, Settings, render_tile},
+    render::{Quality, Sampling, Settings, render_tile},
     tile::{Area, Size},
 };
 
@@ -54,7 +54,8 @@ fn render(name: &str) -> Vec<u8> {
     let prepared = PreparedScene::open(prepare(&scene).unwrap()).unwrap();
     let viewport = scene.viewport.unwrap();
     let size = small(scene.size_hint.unwrap_or_else(|| viewport.default_size()));
-    let settings = Settings { size, samples: 8, seed: 0, flat: false, cutoff: DEFAULT_CUTOFF };
+    let settings =
+        Settings { size, quality: Quality { sampling: Sampling::Fixed(8), ..Quality::default() } };
     let area = Area { x0: 0, y0: 0, width: size.width(), height: size.height() };
 
     let render = |isa| {
@@ -65,7 +66,7 @@ fn render(name: &str) -> Vec<u8> {
         let bits = |pixel: &[f32; 3]| pixel.map(f32::to_bits);
         let other = render(isa);
         assert!(tile.pixels.iter().map(bits).eq(other.pixels.iter().map(bits)), "{name}: {isa}");
-        assert_eq!(tile.rays, other.rays, "{name}: {isa}");
+        assert_eq!(tile.tally.rays, other.tally.rays, "{name}: {isa}");
     }
     let file = tempfile::tempfile().unwrap();
     let picture = Picture::new(file, size, PictureFormat::Png16).unwrap();

@@ -2,7 +2,11 @@
 
 use std::{collections::BTreeSet, time::Duration};
 
-use rtfarm_core::{picture::Picture, render::Settings, tile::TileGrid};
+use rtfarm_core::{
+    picture::Picture,
+    render::{Settings, Tally},
+    tile::TileGrid,
+};
 use rtfarm_proto::{JobId, WorkerId};
 use tokio::{sync::watch, time::Instant};
 
@@ -28,10 +32,8 @@ pub struct Progress {
     pub tiles_done: u32,
     /// Tiles of the picture.
     pub tile_count: u32,
-    /// Rays traced for the tiles in the picture.
-    pub rays: u64,
-    /// The largest sum of weights not traced in any sample so far.
-    pub cut: f64,
+    /// What the tiles in the picture took.
+    pub tally: Tally,
     /// Workers that brought some of them.
     pub workers: BTreeSet<WorkerId>,
     /// Tiles of which two copies differed.

@@ -5,7 +5,7 @@ use rtfarm_core::{
     prepare::{PrepareError, prepare},
     prepared::PreparedBytes,
     read::{Diagnostic, Omitted, Reading, Resolve, Severity, read_scene},
-    render::Settings,
+    render::{Quality, Settings},
     scene::Scene,
     tile::{Size, TileGrid},
 };
@@ -22,14 +22,8 @@ pub struct Wish {
     pub strict: bool,
     /// The frame; the scene's own wish when missing.
     pub size: Option<Size>,
-    /// Samples in every pixel.
-    pub samples: u32,
-    /// Chooses the random numbers.
-    pub seed: u64,
-    /// Plain colours.
-    pub flat: bool,
-    /// The weight below which a branch is not traced.
-    pub cutoff: f64,
+    /// How good the picture is to be.
+    pub quality: Quality,
     /// The side of a tile in pixels; chosen by the frame's size when missing.
     pub tile_side: Option<u64>,
     /// How the picture is written.
@@ -107,7 +101,9 @@ impl Wish {
             )));
         }
         let is_lit = scene.ambient.is_some() || !scene.lights.is_empty();
-        if is_lit && !self.flat && scene.materials.iter().any(|m| m.reflect > 0.0 && m.alpha > 0.0)
+        if is_lit
+            && !self.quality.flat
+            && scene.materials.iter().any(|m| m.reflect > 0.0 && m.alpha > 0.0)
         {
             tracing::warn!(
                 "mirrors do not light other surfaces yet: no secondary light is rendered"
@@ -121,8 +117,8 @@ impl Wish {
             }
             None => other(error.to_string()),
         })?;
-        let Self { name, samples, seed, flat, cutoff, format, .. } = self;
-        let settings = Settings { size, samples, seed, flat, cutoff };
+        let Self { name, quality, format, .. } = self;
+        let settings = Settings { size, quality };
         Ok(Order { name, prepared, settings, grid, format })
     }
 }

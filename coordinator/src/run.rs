@@ -125,7 +125,7 @@ impl Coordinator {
             job = id.0,
             scene = job.name,
             size = %settings.size,
-            samples = settings.samples,
+            sampling = ?settings.quality.sampling,
             tiles = grid.count(),
             side = grid.side(),
             scene_bytes = job.scene.byte_count(),

@@ -11,6 +11,7 @@ use std::{
 use rtfarm_core::{
     picture::{PutError, check_pixels},
     read::{Style, draw_diagnostics},
+    render::Tally,
     tile::{Size, TileId},
 };
 use rtfarm_proto::{
@@ -200,6 +201,8 @@ impl Shared {
         let area = job.grid.area(tile);
         let hash: PixelHash = *blake3::hash(&delivery.pixels).as_bytes();
         let pixels = pixels_from_bytes(&delivery.pixels).map_err(invalid)?;
+        let tally = delivery.tally.ok_or_else(|| invalid(WireError::Missing("tally")))?;
+        let tally = Tally::try_from(tally).map_err(invalid)?;
         if delivery.hash != hash[..] {
             tracing::error!(worker = worker.0, tile = tile.number(), "pixels were damaged");
             return Err(Status::data_loss("the pixels do not have the hash they came with"));
@@ -214,7 +217,7 @@ impl Shared {
         match verdict {
             Some(Verdict::Stitch) => {
                 match job.picture.put(area, &pixels) {
-                    Ok(()) => self.on_stitched(&job, worker, tile, delivery),
+                    Ok(()) => self.on_stitched(&job, worker, tile, (tally, delivery.seconds)),
                     Err(error) => self.fail_picture(&job, &error),
                 }
                 Ok(wire::Verdict::Accepted)
@@ -247,14 +250,13 @@ impl Shared {
         job: &Job,
         worker: WorkerId,
         tile: TileId,
-        delivery: &wire::DeliverRequest,
+        (tally, seconds): (Tally, f64),
     ) {
         let elapsed = job.started.elapsed();
         let mut now_done = Progress::default();
         job.progress.send_modify(|progress| {
             progress.tiles_done += 1;
-            progress.rays += delivery.rays;
-            progress.cut = progress.cut.max(delivery.cut);
+            progress.tally.add(&tally);
             progress.workers.insert(worker);
             now_done.clone_from(progress);
         });
@@ -264,7 +266,7 @@ impl Shared {
             count,
             tile,
             worker,
-            &crate::TileCost { seconds: delivery.seconds, rays: delivery.rays },
+            &crate::TileCost { seconds, rays: tally.rays },
             elapsed,
         );
         if done == count {
@@ -421,23 +423,17 @@ async fn receive(mut parts: Streaming<wire::SubmitRequest>) -> Result<Bundle, St
 fn to_wish(order: wire::Order) -> Result<Wish, WireError> {
     let format = order.format().try_into()?;
     let size = order.frame.map(Size::try_from).transpose()?;
-    let wire::Order { name, samples, seed, flat, cutoff, strict, tile_side, .. } = order;
-    if !rtfarm_proto::SAMPLES.contains(&samples) {
-        return Err(WireError::Samples(samples));
-    }
-    if !(0.0..=1.0).contains(&cutoff) {
-        return Err(WireError::Cutoff(cutoff));
-    }
+    let quality = order.quality.ok_or(WireError::Missing("quality"))?.try_into()?;
+    let wire::Order { name, strict, tile_side, .. } = order;
     let tile_side = (tile_side > 0).then_some(tile_side.into());
-    Ok(Wish { name, strict, size, samples, seed, flat, cutoff, tile_side, format })
+    Ok(Wish { name, strict, size, quality, tile_side, format })
 }
 
 fn to_event(progress: &Progress) -> wire::Event {
     wire::Event {
         tiles_done: progress.tiles_done,
         tile_count: progress.tile_count,
-        rays: progress.rays,
-        cut: progress.cut,
+        tally: Some(progress.tally.into()),
         workers: progress.workers.len() as u32,
         differing_tiles: progress.differing_tiles,
         end: progress.end.as_ref().map(|end| match end {

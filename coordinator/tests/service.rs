@@ -3,6 +3,7 @@
 use std::time::Duration;
 
 use rtfarm_coordinator::{Config, Coordinator, Listener};
+use rtfarm_core::render::{Quality, Sampling};
 use rtfarm_proto::{
     Address, LeaseName, PROTOCOL, pixels_to_bytes,
     wire::{
@@ -52,7 +53,7 @@ impl Farm {
             protocol: PROTOCOL,
             name: "test".to_owned(),
             frame: Some(wire::Frame { width: 16, height: 8 }),
-            samples: 1,
+            quality: Some(Quality { sampling: Sampling::Fixed(1), ..Quality::default() }.into()),
             tile_side: 8,
             format: wire::Format::Png8.into(),
             ..wire::Order::default()
@@ -97,9 +98,8 @@ impl Farm {
             tile,
             pixels: pixels.into(),
             hash: hash.into(),
-            rays: 64,
             seconds: 0.1,
-            cut: 0.0,
+            tally: Some(wire::Tally { rays: 64, ..wire::Tally::default() }),
         };
         let answer = self.tiles.deliver(delivery).await;
         answer.map(|answer| answer.into_inner().verdict()).map_err(|status| status.code())

@@ -17,7 +17,7 @@ use rtfarm_core::{
     isa::Isa,
     prepare::prepare,
     prepared::{PreparedBytes, PreparedScene},
-    render::{DEFAULT_CUTOFF, Settings, render_tile},
+    render::{Quality, Sampling, Settings, render_tile},
     scene::{Scene, Sphere, Viewport},
     tile::{Area, Size},
     trace::Probe,
@@ -93,7 +93,8 @@ fn away(mut scene: Scene) -> Scene {
 
 fn render(scene: &PreparedScene<PreparedBytes>) -> f64 {
     let size = Size::new(320, 180).expect("a size");
-    let settings = Settings { size, samples: 4, seed: 0, flat: false, cutoff: DEFAULT_CUTOFF };
+    let settings =
+        Settings { size, quality: Quality { sampling: Sampling::Fixed(4), ..Quality::default() } };
     let area = Area { x0: 0, y0: 0, width: size.width(), height: size.height() };
     let start = Instant::now();
     let on_progress = &mut || ControlFlow::Continue(());

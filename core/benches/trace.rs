@@ -17,7 +17,7 @@ use rtfarm_core::{
     isa::Isa,
     prepare::prepare,
     prepared::PreparedScene,
-    render::{DEFAULT_CUTOFF, Settings, render_tile},
+    render::{Quality, Sampling, Settings, render_tile},
     tile::{Size, TileGrid},
 };
 
@@ -49,7 +49,10 @@ fn main() {
     let size = Size::new(1280, 720).expect("a size");
     let grid = TileGrid::balanced(size);
     for flat in [true, false] {
-        let settings = Settings { size, samples: 1, seed: 0, flat, cutoff: DEFAULT_CUTOFF };
+        let settings = Settings {
+            size,
+            quality: Quality { sampling: Sampling::Fixed(1), flat, ..Quality::default() },
+        };
         for isa in Isa::ALL.into_iter().filter(|isa| isa.is_supported()) {
             for threads in [1, 2] {
                 let pool =
@@ -63,7 +66,10 @@ fn main() {
                             render_tile(&prepared, &settings, grid.area(tile), isa, on)
                         };
                         let order = grid.render_order();
-                        order.par_iter().map(|&t| tile(t).expect("not stopped").rays).sum::<u64>()
+                        order
+                            .par_iter()
+                            .map(|&t| tile(t).expect("not stopped").tally.rays)
+                            .sum::<u64>()
                     });
                     start.elapsed().as_secs_f64()
                 });

@@ -34,6 +34,7 @@ mod weld;
 // A prepared scene into tiles.
 pub mod isa;
 pub mod picture;
+mod pixel;
 mod quadrangle;
 mod ray;
 pub mod render;

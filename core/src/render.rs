@@ -1,17 +1,19 @@
 //! A tile of a prepared scene into pixels.
 //!
 //! A pixel's samples are added in their own order, and each is a pure function of (scene,
-//! settings, pixel, sample): a pixel is the same to the bit whatever the tile, the batch, the
-//! thread or the CPU.
+//! settings, pixel, sample); how many there are hangs on the first samples of the pixel and its
+//! eight neighbours, and on its own later ones. So a pixel is the same to the bit whatever the
+//! tile, the batch, the thread or the CPU.
 
-use std::ops::ControlFlow;
+use std::ops::{ControlFlow, RangeInclusive};
 
 use glam::DVec3;
 
 use crate::{
     isa::Isa,
-    prepared::PreparedScene,
-    sample::Samples,
+    pixel::Pixel,
+    prepared::{PreparedScene, View},
+    sample::{FEWEST_FOR_ERROR, MOST_SAMPLES, Samples},
     tile::{Area, Size},
     wavefront::{Batch, CameraSample},
 };
@@ -21,16 +23,70 @@ use crate::{
 pub struct Settings {
     /// The frame in pixels.
     pub size: Size,
-    /// Samples in every pixel, `1..=`[`crate::sample::MOST_SAMPLES`].
-    pub samples: u32,
+    /// How good it is to be.
+    pub quality: Quality,
+}
+
+/// How good a picture is to be, and what it shows.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Quality {
+    /// How many samples pixels get.
+    pub sampling: Sampling,
     /// Chooses the random numbers.
     pub seed: u64,
     /// Every surface shows its plain colour, as in a scene without light.
     pub flat: bool,
+    /// Surfaces that mirror light others.
+    pub secondary: bool,
     /// A mirrored or transmitted branch whose weight in its sample is below this is not traced:
     /// it counts as background. 0..=1.
     pub cutoff: f64,
 }
+
+impl Default for Quality {
+    fn default() -> Self {
+        Self {
+            sampling: Sampling::Adaptive { error: DEFAULT_ERROR, most: DEFAULT_MOST_SAMPLES },
+            seed: 0,
+            flat: false,
+            secondary: true,
+            cutoff: DEFAULT_CUTOFF,
+        }
+    }
+}
+
+/// How many samples pixels get.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Sampling {
+    /// The same number everywhere, one of [`Sampling::COUNTS`].
+    Fixed(u32),
+    /// As many as a pixel needs.
+    Adaptive {
+        /// A pixel is sampled until its standard error is below this in each channel. 0..=1, not 0.
+        error: f64,
+        /// But at most so often, one of [`Sampling::MOST_COUNTS`].
+        most: u32,
+    },
+}
+
+impl Sampling {
+    /// How many samples a pixel may be given.
+    pub const COUNTS: RangeInclusive<u32> = 1..=MOST_SAMPLES;
+
+    /// The least upper limit is what an error can be estimated from.
+    pub const MOST_COUNTS: RangeInclusive<u32> = FEWEST_FOR_ERROR..=MOST_SAMPLES;
+
+    /// Whether a standard error can be asked for: above 0, at most 1.
+    pub fn is_error(error: f64) -> bool {
+        error > 0.0 && error <= 1.0
+    }
+}
+
+/// The standard error of a pixel where nobody chose one: an 8-bit step.
+pub const DEFAULT_ERROR: f64 = 1.0 / 255.0;
+
+/// The most samples of a pixel where nobody chose their number.
+pub const DEFAULT_MOST_SAMPLES: u32 = 256;
 
 /// The cut-off where nobody chose one: a sixteenth of an 8-bit step.
 pub const DEFAULT_CUTOFF: f64 = 1.0 / 4096.0;
@@ -40,10 +96,42 @@ pub const DEFAULT_CUTOFF: f64 = 1.0 / 4096.0;
 pub struct RenderedTile {
     /// Linear red, green and blue, 1.0 for 255 in the file, `[y][x]`, row by row.
     pub pixels: Vec<[f32; 3]>,
+    /// What that took and how good it is.
+    pub tally: Tally,
+}
+
+/// What rendering took and how good the pixels are.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct Tally {
     /// Rays traced, of all kinds.
     pub rays: u64,
+    /// Camera rays among them.
+    pub samples: u64,
     /// The largest sum of weights of branches that were not traced, in any sample. 0..=1.
     pub cut: f64,
+    /// Pixels whose error was estimated.
+    pub estimated: u64,
+    /// The sum of those pixels' estimated variances, each the mean of its channels'.
+    pub variance: f64,
+    /// Pixels that got the most samples that they may have and are not below the wanted error.
+    pub capped: u64,
+}
+
+impl Tally {
+    /// Takes that of other pixels in.
+    pub fn add(&mut self, other: &Self) {
+        self.rays += other.rays;
+        self.samples += other.samples;
+        self.cut = self.cut.max(other.cut);
+        self.estimated += other.estimated;
+        self.variance += other.variance;
+        self.capped += other.capped;
+    }
+
+    /// The estimated root-mean-square error of a channel; `None` where no pixel had enough samples.
+    pub fn error(&self) -> Option<f64> {
+        (self.estimated > 0).then(|| (self.variance / self.estimated as f64).sqrt())
+    }
 }
 
 /// Camera rays in a batch: enough to fill the queues, few enough to stay in the cache.
@@ -59,33 +147,141 @@ pub fn render_tile<B: AsRef<[u8]>>(
     isa: Isa,
     on_progress: &mut dyn FnMut() -> ControlFlow<()>,
 ) -> Option<RenderedTile> {
-    let view = scene.view();
-    let samples = u64::from(settings.samples);
-    let sample_count = area.pixel_count() as u64 * samples;
-    let mut sums = vec![DVec3::ZERO; area.pixel_count()];
-    let mut batch = Batch::default();
-    let (mut rays, mut cut) = (0, 0.0_f64);
-    let mut first = 0;
-    while first < sample_count {
-        let last = sample_count.min(first + BATCH as u64);
-        let wanted = (first..last).map(|index| {
-            let pixel = (index / samples) as u32;
-            let (x, y) = (area.x0 + pixel % area.width, area.y0 + pixel / area.width);
-            let of_pixel = Samples::new(settings.samples, settings.seed, x, y);
-            CameraSample { x, y, sample: of_pixel.sample((index % samples) as u32) }
-        });
-        batch.start(&view.header.camera, settings, wanted);
-        match batch.run(&view, settings, isa, on_progress) {
-            ControlFlow::Continue(count) => rays += count,
-            ControlFlow::Break(()) => return None,
+    let mut sampler = Sampler {
+        view: scene.view(),
+        settings,
+        isa,
+        on_progress,
+        batch: Batch::default(),
+        tally: Tally::default(),
+    };
+    let rendered = match settings.quality.sampling {
+        Sampling::Fixed(count) => sampler.sample_evenly(area, count),
+        Sampling::Adaptive { error, most } => sampler.sample_as_needed(area, error, most),
+    };
+    let ControlFlow::Continue(pixels) = rendered else { return None };
+    let mut tally = sampler.tally;
+    for pixel in &pixels {
+        if let Some(variance) = pixel.variance() {
+            tally.estimated += 1;
+            tally.variance += (variance.x + variance.y + variance.z) / 3.0;
         }
-        cut = batch.cut.iter().fold(cut, |largest, &cut| largest.max(cut));
-        for (sample, color) in (first..last).zip(&batch.colors) {
-            sums[(sample / samples) as usize] += *color;
-        }
-        first = last;
     }
-    let count = f64::from(settings.samples);
-    let pixels = sums.into_iter().map(|sum| (sum / count).to_array().map(|x| x as f32)).collect();
-    Some(RenderedTile { pixels, rays, cut })
+    let pixels = pixels.iter().map(|pixel| pixel.mean().to_array().map(|x| x as f32)).collect();
+    Some(RenderedTile { pixels, tally })
+}
+
+/// Gives pixels their samples, a batch at a time.
+struct Sampler<'a> {
+    view: View<'a>,
+    settings: &'a Settings,
+    isa: Isa,
+    on_progress: &'a mut dyn FnMut() -> ControlFlow<()>,
+    batch: Batch,
+    tally: Tally,
+}
+
+impl Sampler<'_> {
+    /// The pixels of `area` with `count` samples each.
+    fn sample_evenly(&mut self, area: Area, count: u32) -> ControlFlow<(), Vec<Pixel>> {
+        let mut pixels = vec![Pixel::default(); area.pixel_count()];
+        let all: Vec<u32> = (0..pixels.len() as u32).collect();
+        self.extend(area, &mut pixels, &all, count)?;
+        ControlFlow::Continue(pixels)
+    }
+
+    /// The pixels of `area` with samples until each one's standard error is below `error`.
+    fn sample_as_needed(
+        &mut self,
+        area: Area,
+        error: f64,
+        most: u32,
+    ) -> ControlFlow<(), Vec<Pixel>> {
+        let (wide, inner) = with_apron(area, self.settings.size);
+        let mut pixels = vec![Pixel::default(); wide.pixel_count()];
+        let all: Vec<u32> = (0..pixels.len() as u32).collect();
+        self.extend(wide, &mut pixels, &all, FEWEST_FOR_ERROR)?;
+
+        // What one pixel's first samples missed its neighbours' may have found.
+        let contrasts: Vec<DVec3> = inner
+            .iter()
+            .map(|&pixel| {
+                let ranges = neighbourhood(wide, pixel).map(|k| pixels[k as usize].range());
+                let range = ranges.reduce(|a, b| [a[0].min(b[0]), a[1].max(b[1])]);
+                let [low, high] = range.expect("a pixel is its own neighbour");
+                high - low
+            })
+            .collect();
+        for (&pixel, contrast) in inner.iter().zip(contrasts) {
+            pixels[pixel as usize].set_contrast(contrast);
+        }
+        let is_open = |pixels: &[Pixel], pixel: u32| !pixels[pixel as usize].is_below(error);
+        let mut open = inner.clone();
+        open.retain(|&pixel| is_open(&pixels, pixel));
+        let mut count = FEWEST_FOR_ERROR;
+        while !open.is_empty() && count < most {
+            count = most.min(2 * count);
+            self.extend(wide, &mut pixels, &open, count)?;
+            open.retain(|&pixel| is_open(&pixels, pixel));
+        }
+        self.tally.capped += open.len() as u64;
+        ControlFlow::Continue(inner.iter().map(|&pixel| pixels[pixel as usize]).collect())
+    }
+
+    /// Brings the `chosen` ones among the pixels of `area`, which all have as many samples, to
+    /// `count` samples each.
+    fn extend(
+        &mut self,
+        area: Area,
+        pixels: &mut [Pixel],
+        chosen: &[u32],
+        count: u32,
+    ) -> ControlFlow<()> {
+        let seed = self.settings.quality.seed;
+        let had = chosen.first().map_or(0, |&pixel| pixels[pixel as usize].count());
+        let each = u64::from(count - had);
+        let wanted = chosen.len() as u64 * each;
+        let pixel_of = |index: u64| chosen[(index / each) as usize];
+        for first in (0..wanted).step_by(BATCH) {
+            let run = first..wanted.min(first + BATCH as u64);
+            let samples = run.clone().map(|index| {
+                let pixel = pixel_of(index);
+                let (x, y) = (area.x0 + pixel % area.width, area.y0 + pixel / area.width);
+                let number = had + (index % each) as u32;
+                CameraSample { x, y, sample: Samples::new(count, seed, x, y).sample(number) }
+            });
+            self.batch.start(&self.view.header.camera, self.settings, samples);
+            self.tally.samples += run.end - run.start;
+            self.tally.rays +=
+                self.batch.run(&self.view, &self.settings.quality, self.isa, self.on_progress)?;
+            for (index, &color) in run.zip(&self.batch.colors) {
+                pixels[pixel_of(index) as usize].add(color);
+            }
+            let cut = self.batch.cut.iter().copied();
+            self.tally.cut = cut.fold(self.tally.cut, f64::max);
+        }
+        ControlFlow::Continue(())
+    }
+}
+
+/// The area and the pixels around it that the frame has, and where the area's own are among them.
+fn with_apron(area: Area, frame: Size) -> (Area, Vec<u32>) {
+    let (x0, y0) = (area.x0.saturating_sub(1), area.y0.saturating_sub(1));
+    let width = frame.width().min(area.x0 + area.width + 1) - x0;
+    let height = frame.height().min(area.y0 + area.height + 1) - y0;
+    let (left, top) = (area.x0 - x0, area.y0 - y0);
+    let inner = (0..area.height)
+        .flat_map(|y| (0..area.width).map(move |x| (top + y) * width + left + x))
+        .collect();
+    (Area { x0, y0, width, height }, inner)
+}
+
+/// A pixel and its neighbours, by their numbers in the area.
+fn neighbourhood(area: Area, pixel: u32) -> impl Iterator<Item = u32> {
+    let (x, y) = (pixel % area.width, pixel / area.width);
+    let rows = y.saturating_sub(1)..=area.height.min(y + 2) - 1;
+    rows.flat_map(move |row| {
+        let columns = x.saturating_sub(1)..=area.width.min(x + 2) - 1;
+        columns.map(move |column| row * area.width + column)
+    })
 }

@@ -12,7 +12,7 @@ use crate::{
     isa::Isa,
     prepared::{Camera, PlaneIndex, View},
     ray::{Hit, Kind, Ray, Surface},
-    render::Settings,
+    render::{Quality, Settings},
     sample::Sample,
     trace::{self, trace, trace_shadows},
     triangle::triangle_normal,
@@ -113,7 +113,7 @@ impl Batch {
     pub(crate) fn run(
         &mut self,
         view: &View<'_>,
-        settings: &Settings,
+        quality: &Quality,
         isa: Isa,
         on_progress: &mut dyn FnMut() -> ControlFlow<()>,
     ) -> ControlFlow<(), u64> {
@@ -130,12 +130,12 @@ impl Batch {
             for index in 0..self.rays.len() {
                 let (ray, hit, branch) = (self.rays[index], self.hits[index], self.branches[index]);
                 if hit.is_some() {
-                    self.meet(view, &ray, &hit, branch, settings.cutoff, depth);
+                    self.meet(view, &ray, &hit, branch, quality.cutoff, depth);
                 } else {
                     self.colors[branch.sample] += branch.weight * background;
                 }
             }
-            ray_count += self.light_points(view, settings.flat, isa);
+            ray_count += self.light_points(view, quality.flat, isa);
             for point in &self.points {
                 self.colors[point.sample] += point.weight * (point.color * point.light);
             }

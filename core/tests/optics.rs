@@ -68,7 +68,11 @@ fn parallel_mirrors_add_up_a_geometric_series_and_report_the_rest() {
             rest *= share;
             depth += 1;
         }
-        assert!((tile.cut - rest).abs() < 1e-14, "{share}: {} cut, truly {rest}", tile.cut);
+        assert!(
+            (tile.tally.cut - rest).abs() < 1e-14,
+            "{share}: {} cut, truly {rest}",
+            tile.tally.cut
+        );
         for pixel in tile.pixels {
             let error = (f64::from(pixel[0]) - (1.0 - rest)).abs();
             assert!(error < 1e-7, "{share}: {pixel:?}, truly {}", 1.0 - rest);
@@ -634,7 +638,7 @@ fn light_that_never_gets_out_adds_up_a_geometric_series_and_no_more() {
                     rest *= 1.0 - alpha;
                 }
             }
-            assert!(tile.cut <= 1.0 + 1e-12);
+            assert!(tile.tally.cut <= 1.0 + 1e-12);
             let kept = tile.pixels.iter().map(|pixel| f64::from(pixel[0]));
             // Rays aside of that plane may get out, and then show no more of the ball.
             let most = kept.fold(0.0, f64::max);
@@ -655,7 +659,11 @@ fn check_grazed(what: &str, scene: &Scene, side: u64) -> u64 {
     let tile = rendered(scene, side);
     let below = tile.pixels.iter().filter(|pixel| **pixel != [0.0, 0.0, 1.0]).count();
     assert_eq!(below, 0, "{what}: rays that go below");
-    assert_eq!((tile.rays, tile.cut), (2 * side * side, 0.0), "{what}: rays that meet it again");
+    assert_eq!(
+        (tile.tally.rays, tile.tally.cut),
+        (2 * side * side, 0.0),
+        "{what}: rays that meet it again"
+    );
     side * side
 }
 

@@ -8,7 +8,8 @@ use std::{fs, path::Path};
 use glam::{DVec2, DVec3};
 use rtfarm_core::{
     prepared::{PreparedBytes, PreparedScene},
-    render::{DEFAULT_CUTOFF, Settings},
+    read::read_scene,
+    render::{Sampling, Settings},
     sample::Samples,
     scene::{Scene, Viewport},
     tile::{Area, Size},
@@ -21,14 +22,15 @@ use rtfarm_oracle::{
     random_scene::{Recipe, Style, random_scene},
     reference_picture,
 };
-use studio::{picture, pixels, prepared, read, settings, whole};
+use studio::{picture, pixels, prepared, quality, read, settings, whole};
 
 /// The channels are rounded to f32 once, at the end; 1.0 is what a scene writes as 255.
 const ROUNDING: f64 = 1e-6;
 
 fn positions(settings: &Settings, x: u32, y: u32) -> Vec<(f64, f64)> {
-    let samples = Samples::new(settings.samples, settings.seed, x, y);
-    (0..settings.samples).map(|k| samples.sample(k).position().into()).collect()
+    let Sampling::Fixed(count) = settings.quality.sampling else { panic!("fixed sampling") };
+    let samples = Samples::new(count, settings.quality.seed, x, y);
+    (0..count).map(|k| samples.sample(k).position().into()).collect()
 }
 
 fn is_same(found: [f32; 3], truth: [f64; 3]) -> bool {
@@ -55,7 +57,8 @@ fn pixel_margin(oracle: &Oracle, scene: &Scene, settings: &Settings, x: u32, y: 
 /// rounding decides; tells how many there are.
 fn check_against_oracle(what: &str, scene: &Scene, settings: &Settings) -> usize {
     let found = picture(scene, settings);
-    let oracle_settings = OracleSettings { flat: settings.flat, ..OracleSettings::default() };
+    let oracle_settings =
+        OracleSettings { flat: settings.quality.flat, ..OracleSettings::default() };
     let of_pixel = |x, y| positions(settings, x, y);
     let truth = reference_picture(scene, settings.size, &of_pixel, &oracle_settings);
     let oracle = Oracle::new(scene);
@@ -79,7 +82,9 @@ fn our_scenes_look_as_the_oracle_sees_them() {
         if path.extension().is_none_or(|extension| extension != "rt") {
             continue;
         }
-        let scene = read(&fs::read_to_string(&path).unwrap());
+        let beside = |file: &str| fs::read(path.with_file_name(file));
+        let reading = read_scene(&fs::read(&path).unwrap(), &beside);
+        let scene = reading.scene.expect("our own scenes are without a fault");
         // Brute force takes its time.
         let is_large = scene.triangles.len() > 1000;
         let settings = if is_large { settings(32, 18, 1) } else { settings(48, 27, 4) };
@@ -129,7 +134,7 @@ fn a_scene_by_others_looks_as_the_oracle_sees_it() {
         return;
     };
     let nothing = |_: &str| Err(std::io::ErrorKind::NotFound.into());
-    let scene = rtfarm_core::read::read_scene(text.as_bytes(), &nothing).scene.unwrap();
+    let scene = read_scene(text.as_bytes(), &nothing).scene.unwrap();
     let close = check_against_oracle("test12783.rt", &scene, &settings(24, 24, 1));
     assert!(close <= 1, "{close} pixels are too close to call");
 }
@@ -180,7 +185,7 @@ fn check_coverage(
     let scene = prepared(scene);
     let mut errors = Vec::new();
     for samples in [16, 64, 256, 1024] {
-        let settings = Settings { size, samples, seed: 3, flat: false, cutoff: DEFAULT_CUTOFF };
+        let settings = Settings { size, quality: quality(samples, 3) };
         let side = f64::from(samples).sqrt();
         let (mut squares, mut edge_count, mut sum, mut worst) = (0.0, 0, 0.0, 0.0_f64);
         for (k, pixel) in (0..).zip(pixels(&scene, &settings, whole(size))) {
@@ -323,8 +328,10 @@ fn check_areas(
 fn the_picture_does_not_depend_on_how_it_is_cut() {
     let scene = prepared(&crowded(Style::Plain));
     let mut random = Random::new(1);
-    for samples in [1, 5, 16] {
-        let settings = settings(71, 43, samples);
+    let samplings = [Sampling::Adaptive { error: 0.02, most: 64 }].into_iter();
+    for sampling in samplings.chain([1, 5, 16].map(Sampling::Fixed)) {
+        let mut settings = settings(71, 43, 1);
+        settings.quality.sampling = sampling;
         let (width, height) = (settings.size.width(), settings.size.height());
         let row = |y0| Area { x0: 0, y0, width, height: 1 };
         let column = |x0| Area { x0, y0: 0, width: 1, height };

@@ -4,7 +4,7 @@ use prost::bytes::Bytes;
 use rtfarm_core::{
     picture::PictureFormat,
     prepared::SceneHash,
-    render::Settings,
+    render::{Quality, Sampling, Settings, Tally},
     tile::{Size, SizeError},
 };
 
@@ -26,15 +26,18 @@ pub enum WireError {
     #[error("{0} samples a pixel are out of range")]
     Samples(u32),
     /// A number is out of its range.
+    #[error("an error of {0} is out of range")]
+    Error(f64),
+    /// A number is out of its range.
     #[error("a cut-off of {0} is out of range")]
     Cutoff(f64),
+    /// What a tile is said to have taken is impossible.
+    #[error("a tally out of range")]
+    Tally,
     /// The frame is none.
     #[error(transparent)]
     Size(#[from] SizeError),
 }
-
-/// Samples that a pixel may have.
-pub const SAMPLES: std::ops::RangeInclusive<u32> = 1..=65_536;
 
 impl TryFrom<wire::Frame> for Size {
     type Error = WireError;
@@ -54,21 +57,77 @@ impl TryFrom<wire::Settings> for Settings {
     type Error = WireError;
 
     fn try_from(settings: wire::Settings) -> Result<Self, WireError> {
-        let wire::Settings { width, height, samples, seed, flat, cutoff } = settings;
-        if !SAMPLES.contains(&samples) {
-            return Err(WireError::Samples(samples));
-        }
-        if !(0.0..=1.0).contains(&cutoff) {
-            return Err(WireError::Cutoff(cutoff));
-        }
-        Ok(Self { size: wire::Frame { width, height }.try_into()?, samples, seed, flat, cutoff })
+        let frame = settings.frame.ok_or(WireError::Missing("frame"))?;
+        let quality = settings.quality.ok_or(WireError::Missing("quality"))?;
+        Ok(Self { size: frame.try_into()?, quality: quality.try_into()? })
     }
 }
 
 impl From<Settings> for wire::Settings {
-    fn from(settings: Settings) -> Self {
-        let Settings { size, samples, seed, flat, cutoff } = settings;
-        Self { width: size.width(), height: size.height(), samples, seed, flat, cutoff }
+    fn from(Settings { size, quality }: Settings) -> Self {
+        Self { frame: Some(size.into()), quality: Some(quality.into()) }
+    }
+}
+
+impl TryFrom<wire::Quality> for Quality {
+    type Error = WireError;
+
+    fn try_from(quality: wire::Quality) -> Result<Self, WireError> {
+        let wire::Quality { sampling, seed, flat, secondary, cutoff } = quality;
+        let sampling = match sampling.ok_or(WireError::Missing("sampling"))? {
+            wire::quality::Sampling::Samples(count) => Sampling::Fixed(count),
+            wire::quality::Sampling::Adaptive(wire::Adaptive { error, most }) => {
+                Sampling::Adaptive { error, most }
+            }
+        };
+        match sampling {
+            Sampling::Fixed(count) if !Sampling::COUNTS.contains(&count) => {
+                return Err(WireError::Samples(count));
+            }
+            Sampling::Adaptive { most, .. } if !Sampling::MOST_COUNTS.contains(&most) => {
+                return Err(WireError::Samples(most));
+            }
+            Sampling::Adaptive { error, .. } if !Sampling::is_error(error) => {
+                return Err(WireError::Error(error));
+            }
+            _ => {}
+        }
+        if !(0.0..=1.0).contains(&cutoff) {
+            return Err(WireError::Cutoff(cutoff));
+        }
+        Ok(Self { sampling, seed, flat, secondary, cutoff })
+    }
+}
+
+impl From<Quality> for wire::Quality {
+    fn from(quality: Quality) -> Self {
+        let Quality { sampling, seed, flat, secondary, cutoff } = quality;
+        let sampling = Some(match sampling {
+            Sampling::Fixed(count) => wire::quality::Sampling::Samples(count),
+            Sampling::Adaptive { error, most } => {
+                wire::quality::Sampling::Adaptive(wire::Adaptive { error, most })
+            }
+        });
+        Self { sampling, seed, flat, secondary, cutoff }
+    }
+}
+
+impl TryFrom<wire::Tally> for Tally {
+    type Error = WireError;
+
+    fn try_from(tally: wire::Tally) -> Result<Self, WireError> {
+        let wire::Tally { rays, samples, cut, estimated, variance, capped } = tally;
+        let is_possible = (0.0..=1.0).contains(&cut) && variance.is_finite() && variance >= 0.0;
+        is_possible
+            .then_some(Self { rays, samples, cut, estimated, variance, capped })
+            .ok_or(WireError::Tally)
+    }
+}
+
+impl From<Tally> for wire::Tally {
+    fn from(tally: Tally) -> Self {
+        let Tally { rays, samples, cut, estimated, variance, capped } = tally;
+        Self { rays, samples, cut, estimated, variance, capped }
     }
 }
 
@@ -142,19 +201,37 @@ mod tests {
 
     #[test]
     fn settings_out_of_range_are_refused() {
-        let good =
-            wire::Settings { width: 2, height: 3, samples: 1, seed: 9, flat: true, cutoff: 0.5 };
+        use wire::quality::Sampling::{Adaptive, Samples};
+        let quality = wire::Quality {
+            sampling: Some(Samples(1)),
+            seed: 9,
+            flat: true,
+            secondary: false,
+            cutoff: 0.5,
+        };
+        let frame = wire::Frame { width: 2, height: 3 };
+        let good = wire::Settings { frame: Some(frame), quality: Some(quality) };
         let settings = Settings::try_from(good).unwrap();
         assert_eq!(wire::Settings::from(settings), good);
+        for frame in [wire::Frame { width: 0, ..frame }, wire::Frame { height: 65_536, ..frame }] {
+            Settings::try_from(wire::Settings { frame: Some(frame), ..good })
+                .expect_err("no frame");
+        }
+        let adaptive = |error, most| Some(Adaptive(wire::Adaptive { error, most }));
+        Quality::try_from(wire::Quality { sampling: adaptive(0.1, 8), ..quality }).unwrap();
         for bad in [
-            wire::Settings { width: 0, ..good },
-            wire::Settings { height: 65_536, ..good },
-            wire::Settings { cutoff: f64::NAN, ..good },
-            wire::Settings { cutoff: 2.0, ..good },
-            wire::Settings { samples: 0, ..good },
-            wire::Settings { samples: 65_537, ..good },
+            wire::Quality { cutoff: f64::NAN, ..quality },
+            wire::Quality { cutoff: 2.0, ..quality },
+            wire::Quality { sampling: None, ..quality },
+            wire::Quality { sampling: Some(Samples(0)), ..quality },
+            wire::Quality { sampling: Some(Samples(65_537)), ..quality },
+            wire::Quality { sampling: adaptive(0.1, 7), ..quality },
+            wire::Quality { sampling: adaptive(0.1, 65_537), ..quality },
+            wire::Quality { sampling: adaptive(0.0, 8), ..quality },
+            wire::Quality { sampling: adaptive(f64::NAN, 8), ..quality },
+            wire::Quality { sampling: adaptive(f64::INFINITY, 8), ..quality },
         ] {
-            Settings::try_from(bad).expect_err("out of range");
+            Quality::try_from(bad).expect_err("out of range");
         }
     }
 }

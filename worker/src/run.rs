@@ -376,8 +376,7 @@ impl Member {
                         tile: tile.number(),
                         hash: blake3::hash(&pixels).as_bytes().to_vec().into(),
                         pixels,
-                        rays: tile_pixels.rays,
-                        cut: tile_pixels.cut,
+                        tally: Some(tile_pixels.tally.into()),
                         seconds: started.elapsed().as_secs_f64(),
                     }
                 });

@@ -7,7 +7,7 @@ use rtfarm_core::{
     prepare::prepare,
     prepared::{PreparedBytes, PreparedScene},
     read::read_scene,
-    render::{DEFAULT_CUTOFF, Settings, render_tile},
+    render::{Quality, Sampling, Settings, render_tile},
     scene::Scene,
     tile::{Area, Size},
 };
@@ -25,13 +25,11 @@ pub(crate) fn prepared(scene: &Scene) -> PreparedScene<PreparedBytes> {
 }
 
 pub(crate) fn settings(width: u64, height: u64, samples: u32) -> Settings {
-    Settings {
-        size: Size::new(width, height).unwrap(),
-        samples,
-        seed: 5,
-        flat: false,
-        cutoff: DEFAULT_CUTOFF,
-    }
+    Settings { size: Size::new(width, height).unwrap(), quality: quality(samples, 5) }
+}
+
+pub(crate) fn quality(samples: u32, seed: u64) -> Quality {
+    Quality { sampling: Sampling::Fixed(samples), seed, secondary: false, ..Quality::default() }
 }
 
 pub(crate) fn whole(size: Size) -> Area {
