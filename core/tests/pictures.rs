@@ -81,7 +81,11 @@ fn our_scenes_look_as_the_oracle_sees_them() {
         if path.extension().is_none_or(|extension| extension != "rt") {
             continue;
         }
-        let scene = read(&fs::read_to_string(&path).unwrap());
+        let text = fs::read_to_string(&path).unwrap();
+        if text.contains(".png") {
+            continue; // Filtered, so `textures.rs` has it.
+        }
+        let scene = read(&text);
         // Brute force takes its time.
         let is_large = scene.triangles.len() > 1000;
         let settings = if is_large { settings(32, 18, 1) } else { settings(48, 27, 4) };
