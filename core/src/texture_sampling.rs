@@ -120,7 +120,7 @@ impl TextureView<'_> {
             return self.bilinear(last, at);
         }
         let finer = self.bilinear(exponent, at);
-        if mantissa == 1.0 {
+        if mantissa <= 1.0 {
             return finer;
         }
         finer + (mantissa - 1.0) * (self.bilinear(exponent + 1, at) - finer)

@@ -316,7 +316,7 @@ fn a_checkerboard_fades_to_its_mean_at_the_horizon() {
         errors.push((far, worst, rms));
     }
     let (far, worst, rms) = errors[0];
-    assert!(far < 0.07 && worst < 0.15 && rms < 0.02, "at one sample: {errors:?}");
+    assert!(far < 0.12 && worst < 0.15 && rms < 0.02, "at one sample: {errors:?}");
     assert!(errors[2..].windows(2).all(|pair| pair[1].2 < 0.7 * pair[0].2), "{errors:?}");
     assert!(errors[4].2 < 0.008, "{errors:?}");
 }
