@@ -29,7 +29,7 @@ pub(crate) struct LevelRecord {
 }
 
 impl TextureRecord {
-    pub(crate) fn levels(&self) -> Range<usize> {
+    pub(crate) fn levels(self) -> Range<usize> {
         self.first_level as usize..self.first_level as usize + self.level_count as usize
     }
 }

@@ -65,9 +65,9 @@ impl Chart {
         let t =
             rising_root(cross(self.twist, self.up), area + turned, cross(self.along, from_corner));
         // NaN, of a face smaller than numbers go, becomes 0.
-        let s = s.max(0.0).min(1.0);
+        let s = if s > 0.0 { s.min(1.0) } else { 0.0 };
         let most = if self.is_triangle { 1.0 - s } else { 1.0 };
-        DVec2::new(s, t.max(0.0).min(most))
+        DVec2::new(s, if t > 0.0 { t.min(most) } else { 0.0 })
     }
 
     /// How a step along the face moves the place; not finite where the map folds.
@@ -153,7 +153,8 @@ mod tests {
         let chart = Chart::new(&corners, DVec3::Z);
         let mut worst = 0.0_f64;
         for k in 0..100 {
-            let border = |value: f64, k: u64| if k % 5 == 0 { value.round() } else { value };
+            let border =
+                |value: f64, k: u64| if k.is_multiple_of(5) { value.round() } else { value };
             let place = DVec2::new(border(random.unit(), k), border(random.unit(), k / 5));
             let (point, condition) = point(&corners, place);
             let found = chart.place(point);

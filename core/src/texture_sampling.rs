@@ -68,18 +68,17 @@ impl TextureView<'_> {
     /// The mean over a footprint, nearly: equal probes along its longer axis, each as wide as its
     /// shorter one. A footprint within a texel gives the image itself, bilinear between the middles
     /// of texels.
-    ///
-    /// Source: McCormack, Perry, Farkas & Jouppi, "Feline: Fast Elliptical Lines for Anisotropic
-    /// Texture Mapping" (1999), but with the axes of the footprint's own ellipse and equal weights,
-    /// which fit a pixel's square.
     pub(crate) fn mean(&self, footprint: &Footprint) -> DVec3 {
+        // Source: McCormack, Perry, Farkas & Jouppi, "Feline: Fast Elliptical Lines for Anisotropic
+        // Texture Mapping" (1999), but with the axes of the footprint's own ellipse and equal
+        // weights, which fit a pixel's square.
         let size = self.size();
         let [a, b] = footprint.sides.map(|side| side * size);
         // The longer axis is an eigenvector of [a b] [a b]ᵀ.
         let (xx, xy, yy) = (a.x * a.x + b.x * b.x, a.x * a.y + b.x * b.y, a.y * a.y + b.y * b.y);
         let half_difference = (xx - yy) / 2.0;
         let root = (half_difference * half_difference + xy * xy).sqrt();
-        let length = ((xx + yy) / 2.0 + root).sqrt();
+        let length = ((xx + yy) * 0.5 + root).sqrt();
         if length <= 1.0 {
             return self.bilinear(0, footprint.center);
         }
