@@ -75,8 +75,8 @@ pub(crate) struct CheckArgs {
 pub(crate) struct ReportArgs {
     /// The scene to measure, against its own picture at many samples; pictures with closed forms
     /// by default.
-    #[command(flatten)]
-    pub(crate) scene: Option<SceneArgs>,
+    #[arg(value_name = "SCENE")]
+    pub(crate) scene: Option<PathBuf>,
 
     /// The folder that report.md and its plot go into; without it the report goes to standard
     /// output.
@@ -288,6 +288,13 @@ impl FromStr for IsaChoice {
 
     fn from_str(name: &str) -> Result<Self, IsaError> {
         if name == "auto" { Ok(Self(Isa::fastest())) } else { name.parse().map(Self) }
+    }
+}
+
+impl ReportArgs {
+    /// The user's own scene.
+    pub(crate) fn scene(&self) -> Option<SceneArgs> {
+        self.scene.clone().map(|path| SceneArgs { path, strict: false })
     }
 }
 

@@ -66,8 +66,8 @@ pub(crate) async fn run(
 ) -> Result<(), Failure> {
     let plan = Plan::new(args.effort);
     let token = stop.clone();
-    let subjects = if let Some(scene) = &args.scene {
-        vec![own_subject(scene, &plan, console, stop).await?]
+    let subjects = if let Some(scene) = args.scene() {
+        vec![own_subject(&scene, &plan, console, stop).await?]
     } else {
         let width = plan.width;
         let known = spawn_blocking(move || known_pictures(width)).await?;
@@ -113,12 +113,11 @@ async fn own_subject(
 ) -> Result<Subject, Failure> {
     let text = SceneText::read(scene, stop).await?;
     let (name, folder) = (scene.name(), scene_folder(scene));
-    let (style, is_strict) = (Console::drawing_style(), scene.strict);
+    let style = Console::drawing_style();
     let reading = spawn_blocking({
         let name = name.clone();
         move || {
             let reading = read_scene(&text, &|path: &str| fs::read(folder.join(path)));
-            let reading = if is_strict { reading.into_strict() } else { reading };
             let report = draw_diagnostics(&name, &text, &reading.diagnostics, style);
             text.ensure_unchanged().map(|()| (reading.scene, report))
         }
