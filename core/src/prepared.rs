@@ -11,7 +11,7 @@ use std::ops::Range;
 use glam::DVec3;
 
 use crate::{
-    bvh,
+    bvh, emitter_tree,
     node::{Child, Frame, Node},
     ray::{Item, Kind, Surface},
     scene::{Material, Sphere},
@@ -21,7 +21,7 @@ use crate::{
 const MAGIC: [u8; 8] = *b"rtfarm\r\n";
 
 /// Changes with the layout or the meaning of any byte.
-const VERSION: u32 = 2;
+const VERSION: u32 = 3;
 
 /// Reads differently on a machine of the other byte order.
 const BYTE_ORDER: u32 = 0x0102_0304;
@@ -79,6 +79,16 @@ pub(crate) struct Features {
     pub(crate) has_clear_shadows: u32,
     /// There are constructive solids.
     pub(crate) has_solids: u32,
+    /// Faces send light on to others: [`Features::AIMED`] or [`Features::UNAIMED`].
+    pub(crate) has_emitters: u32,
+    pub(crate) padding: u32,
+}
+
+impl Features {
+    /// Light is looked for where emitters are, as well as all over the sky.
+    pub(crate) const AIMED: u32 = 1;
+    /// Only all over the sky.
+    pub(crate) const UNAIMED: u32 = 2;
 }
 
 /// Light that comes from everywhere.
@@ -288,6 +298,11 @@ impl MaterialRecord {
         Self { color: color.to_array(), reflect, alpha, refract }
     }
 
+    /// Whether faces send light on to others.
+    pub(crate) fn emits(&self) -> bool {
+        self.reflect * self.alpha * DVec3::from_array(self.color).max_element() > 0.0
+    }
+
     /// What a shadow ray keeps when it crosses a face.
     pub(crate) fn clearness(&self) -> f64 {
         (1.0 - self.alpha) * (1.0 - self.reflect)
@@ -312,6 +327,74 @@ impl LightRecord {
             touches_first: first,
             touches_count: count,
         }
+    }
+}
+
+/// A face that sends light on to others. Records are sorted by rank.
+#[derive(Debug, Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
+#[repr(C)]
+pub(crate) struct EmitterRecord {
+    /// Of a sphere its centre, of a polygon its normal times its area.
+    pub(crate) place: [f64; 3],
+    /// The radius, or the area. Above 0.
+    pub(crate) size: f64,
+    /// About what each side sends on at most, in its brightest channel; of a polygon the side that
+    /// `place` leads to first.
+    pub(crate) radiosity: [f64; 2],
+    /// Of a polygon: the diagonal from the first to the third lies inside; the third of a triangle
+    /// stands there twice.
+    pub(crate) vertices: [u32; 4],
+    pub(crate) rank: u32,
+    pub(crate) shape: u32,
+    /// Its leaf in the tree.
+    pub(crate) node: u32,
+    pub(crate) padding: u32,
+}
+
+impl EmitterRecord {
+    pub(crate) const TRIANGLE: u32 = 0;
+    pub(crate) const QUADRANGLE: u32 = 1;
+    pub(crate) const SPHERE: u32 = 2;
+
+    #[inline(always)]
+    pub(crate) fn is_sphere(&self) -> bool {
+        self.shape == Self::SPHERE
+    }
+
+    #[inline(always)]
+    pub(crate) fn is_triangle(&self) -> bool {
+        self.shape == Self::TRIANGLE
+    }
+}
+
+/// A node of the tree over all emitters.
+#[derive(Debug, Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
+#[repr(C)]
+pub(crate) struct EmitterNode {
+    /// Of a ball around its emitters.
+    pub(crate) center: [f64; 3],
+    pub(crate) radius: f64,
+    /// About the share of that ball's disc that they fill. 0..=1.
+    pub(crate) fill: f64,
+    /// What they send on, by their areas.
+    pub(crate) radiosity: f64,
+    pub(crate) parent: u32,
+    /// The first of two, side by side; not of a leaf.
+    pub(crate) child: u32,
+    /// Of a leaf.
+    pub(crate) emitter: u32,
+    pub(crate) padding: u32,
+}
+
+impl EmitterNode {
+    pub(crate) fn leaf(parent: u32, emitter: u32) -> Self {
+        let child = emitter_tree::NO_NODE;
+        Self { parent, child, emitter, ..bytemuck::Zeroable::zeroed() }
+    }
+
+    #[inline(always)]
+    pub(crate) fn is_leaf(&self) -> bool {
+        self.child == emitter_tree::NO_NODE
     }
 }
 
@@ -358,6 +441,8 @@ sections! {
     solid_nodes: NodeRecord,
     leaves: LeafRecord,
     first_ranks: u32,
+    emitters: EmitterRecord,
+    emitter_nodes: EmitterNode,
 }
 
 /// A block as the tracer reads it.
@@ -390,6 +475,11 @@ impl<'a> View<'a> {
 
     pub(crate) fn solid_leaves(&self, solid: &SolidRecord) -> &'a [LeafRecord] {
         &self.sections.leaves[solid.leaves()]
+    }
+
+    /// The emitter of a rank.
+    pub(crate) fn emitter_of(&self, rank: u32) -> Option<u32> {
+        self.emitters.binary_search_by_key(&rank, |emitter| emitter.rank).ok().map(|k| k as u32)
     }
 
     /// The primitive and its face that have a rank.
@@ -606,6 +696,8 @@ fn check(view: &View<'_>) -> Result<(), &'static str> {
     }
     ensure(view.vertices.iter().all(|vertex| finite(vertex)), "a vertex")?;
     let vertices = |indices: &[u32]| indices.iter().all(|&k| (k as usize) < view.vertices.len());
+    let vertices_or_none =
+        |emitter: &EmitterRecord| emitter.is_sphere() || vertices(&emitter.vertices);
     let material = |index: u32| (index as usize) < view.materials.len();
     let plane = |index: PlaneIndex| index.index() < view.planes.len();
     for face in view.triangles {
@@ -650,5 +742,19 @@ fn check(view: &View<'_>) -> Result<(), &'static str> {
         let end = light.touches_first as usize + light.touches_count as usize;
         ensure(end <= view.touches.len(), "a light")?;
     }
+    for emitter in view.emitters {
+        let is_shape = finite(&emitter.place) && finite(&[emitter.size]) && emitter.size > 0.0;
+        let is_known = emitter.shape <= EmitterRecord::SPHERE && vertices_or_none(emitter);
+        let is_light = emitter.radiosity.iter().all(|&x| (0.0..=1e100).contains(&x));
+        ensure(is_shape && is_known && is_light, "an emitter")?;
+    }
+    ensure(view.emitters.is_sorted_by(|a, b| a.rank < b.rank), "the emitters' order")?;
+    for node in view.emitter_nodes {
+        let numbers = [node.radius, node.fill, node.radiosity];
+        let is_ball = finite(&node.center) && numbers.iter().all(|&x| (0.0..=1e100).contains(&x));
+        ensure(is_ball, "a node of emitters")?;
+    }
+    emitter_tree::check_tree(view.emitter_nodes, view.emitters)
+        .map_err(|()| "the tree of emitters")?;
     Ok(())
 }

@@ -9,11 +9,12 @@ use std::ops::ControlFlow;
 use glam::DVec3;
 
 use crate::{
+    gather::Gatherer,
     isa::Isa,
     prepared::{Camera, PlaneIndex, View},
     ray::{Hit, Kind, Ray, Surface},
     render::{Quality, Settings},
-    sample::Sample,
+    sample::{Sample, node_after},
     trace::{self, trace, trace_shadows},
     triangle::triangle_normal,
 };
@@ -35,6 +36,8 @@ pub(crate) struct CameraSample {
 /// Samples on their way, and the queues that they pass through.
 #[derive(Debug, Default)]
 pub(crate) struct Batch {
+    /// The random numbers of each sample.
+    samples: Vec<Sample>,
     /// The rays of the current depth, and what each adds to.
     rays: Vec<Ray>,
     branches: Vec<Branch>,
@@ -46,6 +49,7 @@ pub(crate) struct Batch {
     shares: Vec<f64>,
     next_rays: Vec<Ray>,
     next_branches: Vec<Branch>,
+    gatherer: Gatherer,
     /// What each sample sees.
     pub(crate) colors: Vec<DVec3>,
     /// Of each sample, the weights of the branches that were not traced.
@@ -58,21 +62,25 @@ struct Branch {
     sample: usize,
     /// The product of the factors on the way from the sample.
     weight: f64,
+    /// Tells the sample's branches apart; 0 for the camera ray.
+    node: u64,
 }
 
 /// A place on a surface that a ray sees.
 #[derive(Debug)]
-struct Point {
-    sample: usize,
+pub(crate) struct Point {
+    pub(crate) sample: usize,
+    /// The number of the branch that has met it.
+    pub(crate) node: u64,
     /// What the surface's own light counts in the sample.
-    weight: f64,
-    position: DVec3,
+    pub(crate) weight: f64,
+    pub(crate) position: DVec3,
     /// Of length 1, towards the side that is seen.
-    normal: DVec3,
-    surface: Surface,
-    color: DVec3,
+    pub(crate) normal: DVec3,
+    pub(crate) surface: Surface,
+    pub(crate) color: DVec3,
     /// The light received so far.
-    light: DVec3,
+    pub(crate) light: DVec3,
 }
 
 impl Batch {
@@ -86,7 +94,9 @@ impl Batch {
         let size = settings.size;
         let screen = [camera.top_left, camera.right, camera.down].map(DVec3::from_array);
         self.rays.clear();
+        self.samples.clear();
         self.rays.extend(samples.map(|CameraSample { x, y, sample }| {
+            self.samples.push(sample);
             let [across, down] = sample.position();
             let u = (f64::from(x) + across) / f64::from(size.width());
             let v = (f64::from(y) + down) / f64::from(size.height());
@@ -100,7 +110,11 @@ impl Batch {
             }
         }));
         self.branches.clear();
-        self.branches.extend((0..self.rays.len()).map(|sample| Branch { sample, weight: 1.0 }));
+        self.branches.extend((0..self.rays.len()).map(|sample| Branch {
+            sample,
+            weight: 1.0,
+            node: 0,
+        }));
         self.colors.clear();
         self.colors.resize(self.rays.len(), DVec3::ZERO);
         self.cut.clear();
@@ -136,6 +150,9 @@ impl Batch {
                 }
             }
             ray_count += self.light_points(view, quality.flat, isa);
+            if quality.secondary && !quality.flat && view.header.features.has_emitters != 0 {
+                ray_count += self.gather(view, isa);
+            }
             for point in &self.points {
                 self.colors[point.sample] += point.weight * (point.color * point.light);
             }
@@ -155,7 +172,7 @@ impl Batch {
         view: &View<'_>,
         ray: &Ray,
         hit: &Hit,
-        Branch { sample, weight }: Branch,
+        Branch { sample, weight, node }: Branch,
         cutoff: f64,
         depth: u32,
     ) {
@@ -169,6 +186,7 @@ impl Batch {
         if reflect < 1.0 && alpha > 0.0 {
             self.points.push(Point {
                 sample,
+                node,
                 weight: weight * ((1.0 - reflect) * alpha),
                 position,
                 normal,
@@ -180,7 +198,7 @@ impl Batch {
         if view.header.features.has_branches == 0 {
             return;
         }
-        let mut follow = |direction: DVec3, after: u32, weight: f64| {
+        let mut follow = |direction: DVec3, after: u32, weight: f64, branch: u64| {
             if weight < cutoff || depth == DEEPEST {
                 self.cut[sample] += weight;
                 return;
@@ -192,12 +210,12 @@ impl Batch {
                 leaving: surface,
                 after,
             });
-            self.next_branches.push(Branch { sample, weight });
+            self.next_branches.push(Branch { sample, weight, node: node_after(node, branch) });
         };
         let cosine = -normal.dot(ray.direction);
         let mirrored = mirror(ray.direction, normal, cosine);
         if reflect > 0.0 {
-            follow(mirrored, Ray::NOTHING_AHEAD, weight * reflect);
+            follow(mirrored, Ray::NOTHING_AHEAD, weight * reflect, 1);
         }
         if reflect < 1.0 && alpha < 1.0 {
             let weight = weight * ((1.0 - reflect) * (1.0 - alpha));
@@ -209,8 +227,8 @@ impl Batch {
                 refract(ray.direction, normal, cosine, ratio)
             };
             match bent {
-                Some(direction) => follow(direction, hit.rank, weight),
-                None => follow(mirrored, Ray::NOTHING_AHEAD, weight), // Total reflection.
+                Some(direction) => follow(direction, hit.rank, weight, 2),
+                None => follow(mirrored, Ray::NOTHING_AHEAD, weight, 2), // Total reflection.
             }
         }
     }
@@ -222,6 +240,16 @@ impl Batch {
             return 0;
         }
         (0..view.lights.len()).map(|index| self.light(view, index, isa)).sum()
+    }
+
+    /// Adds the light that other faces send on to the points; how many rays that took.
+    fn gather(&mut self, view: &View<'_>, isa: Isa) -> u64 {
+        let mut ray_count = self.gatherer.find_sources(view, isa, &self.points, &self.samples);
+        std::mem::swap(&mut self.points, &mut self.gatherer.sources);
+        ray_count += self.light_points(view, false, isa);
+        std::mem::swap(&mut self.points, &mut self.gatherer.sources);
+        self.gatherer.deliver(&mut self.points);
+        ray_count
     }
 
     /// Adds what light `index` gives each point; how many rays that took.
@@ -273,7 +301,7 @@ fn refract(direction: DVec3, normal: DVec3, cosine: f64, ratio: f64) -> Option<D
 }
 
 /// The unit normal towards the front of what a ray hit.
-fn face_normal(view: &View<'_>, hit: &Hit, position: DVec3) -> DVec3 {
+pub(crate) fn face_normal(view: &View<'_>, hit: &Hit, position: DVec3) -> DVec3 {
     let of_plane =
         |plane: PlaneIndex| DVec3::from_array(view.planes[plane.index()].normal) * plane.sign();
     let of_sphere = |center: [f64; 3]| {
