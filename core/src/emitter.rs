@@ -21,13 +21,17 @@ pub(crate) struct Receiver {
     pub(crate) normal: DVec3,
 }
 
-/// How much an emitter, or a group of them, may give a receiver.
+/// How much an emitter, or a group of them, may give a receiver: what it pays to aim at, and what
+/// rays over the whole sky find as well.
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct Promise {
     /// About how much of the receiver's cosine-weighted sky it covers: 0..=1.
     pub(crate) share: f64,
-    /// About how much light comes from it: the share times what it sends on at most.
+    /// About how much light comes from what it pays to aim at: its share times what it sends on
+    /// at most.
     pub(crate) light: f64,
+    /// The mean square of what a ray of the whole sky brings from the rest.
+    pub(crate) square: f64,
 }
 
 /// A direction in which to look for light.
@@ -49,16 +53,18 @@ const LEAST_SKY: f64 = 0.05;
 
 /// The share of the sky from which on emitters fill it so far that choosing among them is no
 /// gain.
-const FULL_SHARE: f64 = 0.5;
+pub(crate) const FULL_SHARE: f64 = 0.5;
 
-/// The probability with which the whole sky is sampled where emitters cover `share` of it.
-fn sky_probability(share: f64) -> f64 {
-    if share > 0.0 && share < FULL_SHARE {
-        let filled = share / FULL_SHARE;
-        LEAST_SKY + (1.0 - LEAST_SKY) * (filled * filled)
-    } else {
-        1.0
-    }
+/// The probability with which the whole sky is sampled above which it is sampled always.
+const MOST_SKY: f64 = 0.6;
+
+/// The probability with which the whole sky is sampled where emitters promise this: in proportion
+/// to the deviation of what it finds, against that of the light aimed at, which is about its mean.
+fn sky_probability(promise: &Promise) -> f64 {
+    let deviation = promise.square.sqrt();
+    let sky = (deviation / (deviation + promise.light)).max(LEAST_SKY);
+    // Also where nothing is promised.
+    if sky < MOST_SKY && promise.share < FULL_SHARE { sky } else { 1.0 }
 }
 
 /// Chooses a direction by three numbers in 0..1: one sample from a mixture of the cosine-weighted
@@ -73,7 +79,7 @@ pub(crate) fn aim(view: &View<'_>, receiver: &Receiver, numbers: [f64; 3]) -> Op
         return toward_sky(receiver, 1.0, [u, v]);
     }
     let survey = Survey::new(view, receiver);
-    let sky = sky_probability(survey.share());
+    let sky = sky_probability(survey.total());
     if choice < sky {
         return toward_sky(receiver, sky, [u, v]);
     }
@@ -217,19 +223,19 @@ fn on_polygon(corners: &[DVec3; 4], [u, v]: [f64; 2]) -> DVec3 {
 
 /// What an emitter promises a receiver.
 pub(crate) fn promise(view: &View<'_>, emitter: &EmitterRecord, receiver: &Receiver) -> Promise {
-    let (share, side) = if emitter.is_sphere() {
-        let center = DVec3::from_array(emitter.place);
-        let to_center = center - receiver.position;
-        let distance = to_center.length();
-        if distance - emitter.size <= distance * SPHERE_CONTACT {
-            return Promise::default();
-        }
-        let cosine = receiver.normal.dot(to_center) / distance;
-        (sphere_share(cosine, emitter.size / distance), 0)
-    } else {
-        polygon_share(view, emitter, receiver)
-    };
-    Promise { share, light: share * emitter.radiosity[side] }
+    if !emitter.is_sphere() {
+        return polygon_promise(view, emitter, receiver);
+    }
+    let [radiosity, _] = emitter.radiosity;
+    let to_center = DVec3::from_array(emitter.place) - receiver.position;
+    let distance = to_center.length();
+    if distance - emitter.size <= distance * SPHERE_CONTACT {
+        // All around, if it is there.
+        return Promise { share: 1.0, light: 0.0, square: radiosity * radiosity };
+    }
+    let cosine = receiver.normal.dot(to_center) / distance;
+    let share = sphere_share(cosine, emitter.size / distance);
+    Promise { share, light: share * radiosity, square: 0.0 }
 }
 
 /// About the share of the sky that a sphere covers whose centre is seen under an angle of this
@@ -242,27 +248,46 @@ pub(crate) fn sphere_share(cosine: f64, sine: f64) -> f64 {
     0.25 * sine * (above * above)
 }
 
-/// About the share of the sky that a polygon covers, and which of its sides is seen: the mean
-/// over places near its corners of what a disc of its area would cover there.
-fn polygon_share(view: &View<'_>, emitter: &EmitterRecord, receiver: &Receiver) -> (f64, usize) {
+/// What a polygon promises. A near one, compared with its size, is left to the whole sky: its
+/// places are chosen by area, and of those next to the receiver that chooses too few.
+fn polygon_promise(view: &View<'_>, emitter: &EmitterRecord, receiver: &Receiver) -> Promise {
     let turned_area = DVec3::from_array(emitter.place);
     let all = corners(view, emitter).map(|corner| corner - receiver.position);
     let corners = if emitter.is_triangle() { &all[..3] } else { &all[..] };
-    let count = corners.len() as f64;
-    let middle = corners.iter().sum::<DVec3>() / count;
-    let mut sum = 0.0;
-    for &corner in corners {
-        let place = middle + 0.8 * (corner - middle);
-        let height = receiver.normal.dot(place);
-        if height > 0.0 {
-            let squared = place.length_squared();
-            sum += height / (squared * (PI * squared + emitter.size));
-        }
-    }
     let toward = turned_area.dot(all[0]);
+    let radiosity = emitter.radiosity[usize::from(toward > 0.0)];
+    let part = emitter.size / corners.len() as f64;
+    let middle = corners.iter().sum::<DVec3>() / corners.len() as f64;
+    let squared = middle.length_squared();
+    // The share of the sky that a disc of its area covers at the best angle: 0..=1.
+    let nearness = emitter.size / (emitter.size + PI * squared);
+    let aimed = (NEAR - nearness).clamp(0.0, NEAR - FAR) / (NEAR - FAR);
+    // About it at this angle.
+    let mut share = nearness * toward.abs() / (emitter.size * squared.sqrt());
+    if aimed > 0.0 {
+        // A part at each corner, as a disc.
+        let mut sum = 0.0;
+        for &corner in corners {
+            let place = 0.5 * (middle + corner);
+            let height = receiver.normal.dot(place);
+            if height > 0.0 {
+                let squared = place.length_squared();
+                sum += height / (squared * (PI * squared + part));
+            }
+        }
+        share = toward.abs() * sum / corners.len() as f64;
+    }
     // `min` makes a number of 0/0.
-    ((toward.abs() * sum / count).min(1.0), usize::from(toward > 0.0))
+    let share = share.min(1.0);
+    let square = share * (1.0 - aimed) * (radiosity * radiosity);
+    Promise { share, light: share * aimed * radiosity, square }
 }
+
+/// From this nearness on a polygon is not aimed at.
+const NEAR: f64 = 0.3;
+
+/// Up to this nearness it is left to aiming alone.
+const FAR: f64 = 0.05;
 
 /// A place uniform in the unit disc by a place in the unit square.
 ///

@@ -7,7 +7,7 @@
 use glam::DVec3;
 
 use crate::{
-    emitter::{Promise, Receiver, promise, sphere_share},
+    emitter::{FULL_SHARE, Promise, Receiver, promise, sphere_share},
     prepared::{EmitterNode, EmitterRecord, View},
 };
 
@@ -21,55 +21,61 @@ const OPENED: usize = 8;
 /// anything.
 pub(crate) struct Survey {
     nodes: [u32; OPENED],
-    promises: [Promise; OPENED],
+    /// The light of each.
+    lights: [f64; OPENED],
     count: usize,
+    total: Promise,
 }
 
 impl Survey {
     pub(crate) fn new(view: &View<'_>, receiver: &Receiver) -> Self {
         let mut survey =
-            Self { nodes: [0; OPENED], promises: [Promise::default(); OPENED], count: 0 };
+            Self { nodes: [0; OPENED], lights: [0.0; OPENED], count: 0, total: Promise::default() };
         if view.emitters.len() <= OPENED {
             for emitter in view.emitters {
-                survey.add(view, receiver, emitter.node);
+                survey.take(emitter.node, &promise(view, emitter, receiver));
+                if survey.total.share >= FULL_SHARE {
+                    break; // Nothing will be aimed at.
+                }
             }
             return survey;
         }
-        survey.add(view, receiver, 0);
-        while survey.count < OPENED {
-            let is_inner = |&k: &usize| !view.emitter_nodes[survey.nodes[k] as usize].is_leaf();
-            let light = |k: usize| survey.promises[k].light;
-            let inner = (0..survey.count).filter(is_inner);
+        // Nodes whose children may take their place, and what they promise.
+        let mut open = [(0, Promise::default()); OPENED];
+        let mut count = 1;
+        open[0] = (0, node_promise(view, receiver, 0));
+        while count < OPENED {
+            let is_inner = |&k: &usize| !view.emitter_nodes[open[k].0 as usize].is_leaf();
+            let light = |k: usize| open[k].1.light;
+            let inner = (0..count).filter(is_inner);
             let Some(widest) = inner.reduce(|a, b| if light(b) > light(a) { b } else { a }) else {
                 break;
             };
-            let first = view.emitter_nodes[survey.nodes[widest] as usize].child;
-            survey.count -= 1;
-            survey.nodes[widest] = survey.nodes[survey.count];
-            survey.promises[widest] = survey.promises[survey.count];
-            survey.add(view, receiver, first);
-            survey.add(view, receiver, first + 1);
+            let first = view.emitter_nodes[open[widest].0 as usize].child;
+            open[widest] = (first, node_promise(view, receiver, first));
+            open[count] = (first + 1, node_promise(view, receiver, first + 1));
+            count += 1;
+        }
+        for (node, promise) in &open[..count] {
+            survey.take(*node, promise);
         }
         survey
     }
 
-    fn add(&mut self, view: &View<'_>, receiver: &Receiver, node: u32) {
-        let promise = node_promise(view, receiver, node);
+    fn take(&mut self, node: u32, promise: &Promise) {
+        self.total.share += promise.share;
+        self.total.square += promise.square;
         if promise.light > 0.0 {
             self.nodes[self.count] = node;
-            self.promises[self.count] = promise;
+            self.lights[self.count] = promise.light;
             self.count += 1;
+            self.total.light += promise.light;
         }
     }
 
-    /// About the share of the receiver's sky that emitters cover; may be above 1.
-    pub(crate) fn share(&self) -> f64 {
-        self.promises[..self.count].iter().map(|promise| promise.share).sum()
-    }
-
-    /// The light that all promise.
-    fn light(&self) -> f64 {
-        self.promises[..self.count].iter().map(|promise| promise.light).sum()
+    /// What all together promise; the share may be above 1.
+    pub(crate) fn total(&self) -> &Promise {
+        &self.total
     }
 
     /// Chooses an emitter by a number in 0..1; with which probability. `None` where the walk ends
@@ -80,14 +86,14 @@ impl Survey {
         receiver: &Receiver,
         number: f64,
     ) -> Option<(u32, f64)> {
-        let total = self.light();
+        let total = self.total.light;
         let mut left = number * total;
         let mut chosen = 0;
-        while chosen + 1 < self.count && left >= self.promises[chosen].light {
-            left -= self.promises[chosen].light;
+        while chosen + 1 < self.count && left >= self.lights[chosen] {
+            left -= self.lights[chosen];
             chosen += 1;
         }
-        let light = self.promises[..self.count].get(chosen)?.light;
+        let light = *self.lights[..self.count].get(chosen)?;
         let mut probability = light / total;
         let mut number = (left / light).min(1.0);
         let mut node = &view.emitter_nodes[self.nodes[chosen] as usize];
@@ -118,7 +124,7 @@ impl Survey {
         let mut probability = 1.0;
         loop {
             if let Some(k) = self.nodes[..self.count].iter().position(|&node| node == at) {
-                return probability * (self.promises[k].light / self.light());
+                return probability * (self.lights[k] / self.total.light);
             }
             let parent = view.emitter_nodes[at as usize].parent;
             if parent == NO_NODE {
@@ -154,7 +160,8 @@ fn node_promise(view: &View<'_>, receiver: &Receiver, index: u32) -> Promise {
     } else {
         1.0
     };
-    Promise { share: whole * node.fill, light: whole * node.fill * node.radiosity }
+    let share = whole * node.fill;
+    Promise { share, light: share * node.radiosity, square: 0.0 }
 }
 
 /// What the tree is made of: an emitter's bounding ball, its area and what it sends on.
