@@ -21,7 +21,7 @@ use crate::{
     args::CheckArgs,
     console::Console,
     failure::Failure,
-    render::{read_text, scene_folder},
+    source::{SceneText, scene_folder},
 };
 
 pub(crate) async fn run(
@@ -29,7 +29,7 @@ pub(crate) async fn run(
     console: &Console,
     stop: &CancellationToken,
 ) -> Result<(), Failure> {
-    let text = read_text(&args.scene, stop).await?;
+    let text = SceneText::read(&args.scene, stop).await?;
     let name = args.scene.name();
     let style = Console::drawing_style();
     let checking = spawn_blocking(move || {
@@ -40,12 +40,14 @@ pub(crate) async fn run(
         }
         let report = draw_diagnostics(&args.scene.name(), &text, &reading.diagnostics, style);
         let findings = reading.scene.as_ref().map(Findings::new);
-        (args.json, report, reading, findings)
+        text.ensure_unchanged().map(|()| (args.json, report, reading, findings))
     });
-    let (is_json, report, reading, findings) = tokio::select! {
+    let checked = tokio::select! {
         checked = checking => checked?,
         () = stop.cancelled() => return Err(Failure::Interrupted),
     };
+    let (is_json, report, reading, findings) =
+        checked.with_context(|| format!("cannot read the scene {name}"))?;
     let is_valid = reading.scene.is_some();
     let mut output = io::stdout().lock();
     let told = if is_json {

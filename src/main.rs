@@ -9,6 +9,7 @@ mod failure;
 mod local;
 mod output;
 mod render;
+mod source;
 mod submit;
 mod worker;
 

@@ -2,17 +2,15 @@
 
 use std::{
     fs,
-    io::{self, Read, Write},
+    io::{self, Write},
     os::unix::fs::PermissionsExt,
-    path::{Path, PathBuf},
+    path::Path,
     sync::Arc,
     time::Duration,
 };
 
 use anyhow::{Context, anyhow};
-use rtfarm_coordinator::{
-    Config, Coordinator, End, Job, Listener, Order, Progress, Refusal, folder_of,
-};
+use rtfarm_coordinator::{Config, Coordinator, End, Job, Listener, Order, Progress, Refusal};
 use rtfarm_core::{
     picture::Picture,
     read::draw_diagnostics,
@@ -26,12 +24,13 @@ use tokio_util::sync::CancellationToken;
 
 use crate::{
     VERSION,
-    args::{PictureArgs, RenderArgs, SceneArgs},
+    args::{PictureArgs, RenderArgs},
     children::{Children, Setup},
     console::Console,
     failure::Failure,
     local,
     output::Output,
+    source::{SceneText, scene_folder},
 };
 
 /// What there is to say about a finished render.
@@ -98,7 +97,7 @@ pub(crate) async fn run(
     let started = Instant::now();
     let mut output = args.picture.output().map_err(Failure::Input)?;
     output.check()?;
-    let text = read_text(&args.picture.scene, stop).await?;
+    let text = SceneText::read(&args.picture.scene, stop).await?;
     let order = place(&args.picture, &output, text, console, stop).await?;
     let summary = match args.workers_and_threads() {
         (0, threads) => render_here(order, threads, &args, &output, console, stop).await?,
@@ -108,39 +107,11 @@ pub(crate) async fn run(
     Ok(())
 }
 
-/// Where the files are that a scene names: they are relative to its own.
-pub(crate) fn scene_folder(scene: &SceneArgs) -> PathBuf {
-    if scene.is_from_stdin() { ".".into() } else { folder_of(&scene.path) }
-}
-
-/// Reads the scene's file or standard input.
-pub(crate) async fn read_text(
-    scene: &SceneArgs,
-    stop: &CancellationToken,
-) -> Result<Vec<u8>, Failure> {
-    let (path, is_from_stdin) = (scene.path.clone(), scene.is_from_stdin());
-    let read = spawn_blocking(move || {
-        if is_from_stdin {
-            let mut text = Vec::new();
-            io::stdin().lock().read_to_end(&mut text).map(|_| text)
-        } else if fs::metadata(&path)?.is_dir() {
-            Err(io::Error::other("it is a folder"))
-        } else {
-            fs::read(&path)
-        }
-    });
-    let text = tokio::select! {
-        text = read => text?,
-        () = stop.cancelled() => return Err(Failure::Interrupted),
-    };
-    Ok(text.with_context(|| format!("cannot read the scene {}", scene.name()))?)
-}
-
 /// Reads and prepares the scene, and tells its diagnostics.
 async fn place(
     args: &PictureArgs,
     output: &Output,
-    text: Vec<u8>,
+    text: SceneText,
     console: &Console,
     stop: &CancellationToken,
 ) -> Result<Order, Failure> {
@@ -151,12 +122,14 @@ async fn place(
         let placed = wish.place(&text, &|path: &str| fs::read(folder.join(Path::new(path))));
         let mut report = draw_diagnostics(&name, &text, &placed.diagnostics, style);
         report.extend(placed.omitted.summary());
-        (placed.order, report)
+        text.ensure_unchanged().map(|()| (placed.order, report))
     });
-    let (order, report) = tokio::select! {
+    let placed = tokio::select! {
         placed = placing => placed?,
         () = stop.cancelled() => return Err(Failure::Interrupted),
     };
+    let (order, report) =
+        placed.with_context(|| format!("cannot read the scene {}", args.scene.name()))?;
     console.tell_report(&report);
     order.map_err(|refusal| match refusal {
         Refusal::Scene => Failure::Told,

@@ -27,7 +27,8 @@ use crate::{
     console::Console,
     failure::Failure,
     output::Output,
-    render::{Summary, read_text, scene_folder},
+    render::Summary,
+    source::{SceneText, scene_folder},
 };
 
 /// A scene may be large and take long to prepare.
@@ -46,7 +47,7 @@ pub(crate) async fn run(
     let started = Instant::now();
     let mut output = args.picture.output().map_err(Failure::Input)?;
     output.check()?;
-    let text = read_text(&args.picture.scene, stop).await?;
+    let text = SceneText::read(&args.picture.scene, stop).await?;
     let channel = args.coordinator.connect().await;
     let channel =
         channel.with_context(|| format!("no coordinator answers at {}", args.coordinator))?;
@@ -81,7 +82,7 @@ async fn submit(
     client: &mut JobsClient<Channel>,
     args: &SubmitArgs,
     output: &Output,
-    text: Vec<u8>,
+    text: SceneText,
     console: &Console,
 ) -> Result<wire::Accepted, Failure> {
     let wish = args.picture.wish(output.format());
@@ -98,9 +99,10 @@ async fn submit(
     let folder = scene_folder(&args.picture.scene);
     let (text, files) = spawn_blocking(move || {
         let files = named_files(&text, &folder);
-        (text, files)
+        text.ensure_unchanged().map(|()| (text, files))
     })
-    .await?;
+    .await?
+    .with_context(|| format!("cannot read the scene {}", args.picture.scene.name()))?;
     let (send, parts) = mpsc::channel(2);
     tokio::spawn(async move {
         let pieces = text.chunks(CHUNK_BYTES).map(|piece| Part::Text(piece.to_vec().into()));

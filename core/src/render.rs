@@ -7,6 +7,8 @@
 
 use std::ops::{ControlFlow, RangeInclusive};
 
+use glam::DVec3;
+
 use crate::{
     isa::Isa,
     pixel::Pixel,
@@ -201,21 +203,28 @@ impl Sampler<'_> {
         self.extend(wide, &mut pixels, &all, FEWEST_FOR_ERROR)?;
 
         // What one pixel's first samples missed its neighbours' may have found.
-        let is_rough: Vec<bool> = pixels.iter().map(|pixel| !pixel.is_below(error)).collect();
-        let mut active: Vec<u32> = inner
+        let contrasts: Vec<DVec3> = inner
             .iter()
-            .copied()
-            .filter(|&pixel| {
-                neighbourhood(wide, pixel).any(|neighbour| is_rough[neighbour as usize])
+            .map(|&pixel| {
+                let ranges = neighbourhood(wide, pixel).map(|k| pixels[k as usize].range());
+                let range = ranges.reduce(|a, b| [a[0].min(b[0]), a[1].max(b[1])]);
+                let [low, high] = range.expect("a pixel is its own neighbour");
+                high - low
             })
             .collect();
-        let mut count = FEWEST_FOR_ERROR;
-        while !active.is_empty() && count < most {
-            count = most.min(2 * count);
-            self.extend(wide, &mut pixels, &active, count)?;
-            active.retain(|&pixel| !pixels[pixel as usize].is_below(error));
+        for (&pixel, contrast) in inner.iter().zip(contrasts) {
+            pixels[pixel as usize].set_contrast(contrast);
         }
-        self.tally.capped += active.len() as u64;
+        let is_open = |pixels: &[Pixel], pixel: u32| !pixels[pixel as usize].is_below(error);
+        let mut open = inner.clone();
+        open.retain(|&pixel| is_open(&pixels, pixel));
+        let mut count = FEWEST_FOR_ERROR;
+        while !open.is_empty() && count < most {
+            count = most.min(2 * count);
+            self.extend(wide, &mut pixels, &open, count)?;
+            open.retain(|&pixel| is_open(&pixels, pixel));
+        }
+        self.tally.capped += open.len() as u64;
         ControlFlow::Continue(inner.iter().map(|&pixel| pixels[pixel as usize]).collect())
     }
 
@@ -250,9 +259,6 @@ impl Sampler<'_> {
             }
             let cut = self.batch.cut.iter().copied();
             self.tally.cut = cut.fold(self.tally.cut, f64::max);
-        }
-        for &pixel in chosen {
-            pixels[pixel as usize].note_variance();
         }
         ControlFlow::Continue(())
     }

@@ -26,6 +26,7 @@ mod radiance;
 
 // What needs no rays.
 pub mod closed_forms;
+pub mod known_pictures;
 
 // What tests throw at the oracle and at the tracer.
 pub mod random;

@@ -1,0 +1,123 @@
+//! The scene's text: long files are mapped, not copied.
+
+use std::{
+    fs::{self, File, Metadata},
+    io::{self, Read},
+    path::{Path, PathBuf},
+    time::SystemTime,
+};
+
+use anyhow::Context;
+use memmap2::Mmap;
+use rtfarm_coordinator::folder_of;
+use tokio::task::spawn_blocking;
+use tokio_util::sync::CancellationToken;
+
+use crate::{args::SceneArgs, failure::Failure};
+
+/// From here on a copy would count.
+const LONG: u64 = 16 << 20;
+
+/// A scene's text, in memory or mapped.
+#[derive(Debug)]
+pub(crate) enum SceneText {
+    Copied(Vec<u8>),
+    Mapped { map: Mmap, file: File, state: FileState },
+}
+
+/// By which a file that was written to is known.
+#[derive(Debug, PartialEq)]
+pub(crate) struct FileState {
+    length: u64,
+    written: Option<SystemTime>,
+}
+
+impl FileState {
+    fn new(metadata: &Metadata) -> Self {
+        Self { length: metadata.len(), written: metadata.modified().ok() }
+    }
+}
+
+impl SceneText {
+    /// Reads the scene's file or standard input.
+    pub(crate) async fn read(scene: &SceneArgs, stop: &CancellationToken) -> Result<Self, Failure> {
+        let (path, is_from_stdin) = (scene.path.clone(), scene.is_from_stdin());
+        let read = spawn_blocking(move || {
+            if is_from_stdin {
+                let mut text = Vec::new();
+                io::stdin().lock().read_to_end(&mut text).map(|_| Self::Copied(text))
+            } else {
+                Self::open(&path)
+            }
+        });
+        let text = tokio::select! {
+            text = read => text?,
+            () = stop.cancelled() => return Err(Failure::Interrupted),
+        };
+        Ok(text.with_context(|| format!("cannot read the scene {}", scene.name()))?)
+    }
+
+    #[expect(unsafe_code, reason = "a map is as good as what is known about its file")]
+    fn open(path: &Path) -> io::Result<Self> {
+        let metadata = fs::metadata(path)?;
+        if metadata.is_dir() {
+            return Err(io::Error::other("it is a folder"));
+        }
+        if !metadata.is_file() || metadata.len() < LONG {
+            return fs::read(path).map(Self::Copied);
+        }
+        let file = File::open(path)?;
+        let state = FileState::new(&file.metadata()?);
+        // SAFETY: the bytes are only ever read, by a reader that takes any bytes whatever and holds
+        // no assumption about them from one look to the next; that nobody wrote to the file in
+        // the meantime is asked afterwards, before anything is made of what was read. Who cuts a
+        // file short while it is read ends the process (SIGBUS), as with every program that maps.
+        let map = unsafe { Mmap::map(&file) }?;
+        Ok(Self::Mapped { map, file, state })
+    }
+
+    /// Refuses a text whose file was written to since it was opened.
+    pub(crate) fn ensure_unchanged(&self) -> io::Result<()> {
+        match self {
+            Self::Mapped { file, state, .. } if FileState::new(&file.metadata()?) != *state => {
+                Err(io::Error::other("the file was written to while it was read"))
+            }
+            _ => Ok(()),
+        }
+    }
+}
+
+impl std::ops::Deref for SceneText {
+    type Target = [u8];
+
+    fn deref(&self) -> &[u8] {
+        match self {
+            Self::Copied(text) => text,
+            Self::Mapped { map, .. } => map,
+        }
+    }
+}
+
+/// Where the files are that a scene names: they are relative to its own.
+pub(crate) fn scene_folder(scene: &SceneArgs) -> PathBuf {
+    if scene.is_from_stdin() { ".".into() } else { folder_of(&scene.path) }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::io::Write;
+
+    use super::*;
+
+    #[test]
+    fn a_long_file_that_changes_is_refused() {
+        let mut file = tempfile::NamedTempFile::new().unwrap();
+        file.write_all(&vec![b' '; LONG as usize]).unwrap();
+        let text = SceneText::open(file.path()).unwrap();
+        assert!(matches!(text, SceneText::Mapped { .. }));
+        assert_eq!(text.len() as u64, LONG);
+        text.ensure_unchanged().unwrap();
+        file.write_all(b"# more\n").unwrap();
+        text.ensure_unchanged().unwrap_err();
+    }
+}
