@@ -248,7 +248,7 @@ pub(crate) fn sphere_share(cosine: f64, sine: f64) -> f64 {
     0.25 * sine * (above * above)
 }
 
-/// What a polygon promises. A near one, compared with its size, is left to the whole sky: its
+/// What a polygon promises. A near one, compared with its size, that covers much is left to the whole sky: its
 /// places are chosen by area, and of those next to the receiver that chooses too few.
 fn polygon_promise(view: &View<'_>, emitter: &EmitterRecord, receiver: &Receiver) -> Promise {
     let turned_area = DVec3::from_array(emitter.place);
@@ -261,10 +261,10 @@ fn polygon_promise(view: &View<'_>, emitter: &EmitterRecord, receiver: &Receiver
     let squared = middle.length_squared();
     // The share of the sky that a disc of its area covers at the best angle: 0..=1.
     let nearness = emitter.size / (emitter.size + PI * squared);
-    let aimed = (NEAR - nearness).clamp(0.0, NEAR - FAR) / (NEAR - FAR);
+    let is_far = (NEAR - nearness).clamp(0.0, NEAR - FAR) / (NEAR - FAR);
     // About it at this angle.
     let mut share = nearness * toward.abs() / (emitter.size * squared.sqrt());
-    if aimed > 0.0 {
+    if is_far > 0.0 || share < 2.0 * SMALL {
         // A part at each corner, as a disc.
         let mut sum = 0.0;
         for &corner in corners {
@@ -279,6 +279,8 @@ fn polygon_promise(view: &View<'_>, emitter: &EmitterRecord, receiver: &Receiver
     }
     // `min` makes a number of 0/0.
     let share = share.min(1.0);
+    // Rays of the whole sky seldom find a small one, however near.
+    let aimed = is_far.max(((2.0 * SMALL - share) / SMALL).min(1.0));
     let square = share * (1.0 - aimed) * (radiosity * radiosity);
     Promise { share, light: share * aimed * radiosity, square }
 }
@@ -288,6 +290,9 @@ const NEAR: f64 = 0.3;
 
 /// Up to this nearness it is left to aiming alone.
 const FAR: f64 = 0.05;
+
+/// A share of the sky that is small; twice of it is not.
+const SMALL: f64 = 0.05;
 
 /// A place uniform in the unit disc by a place in the unit square.
 ///
