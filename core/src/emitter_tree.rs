@@ -204,8 +204,10 @@ pub(crate) fn build_tree(emitters: &mut [EmitterRecord], twigs: &[Twig]) -> Vec<
         let extent = high - low;
         let axis = if extent.x >= extent.max_element() {
             0
+        } else if extent.y >= extent.z {
+            1
         } else {
-            if extent.y >= extent.z { 1 } else { 2 }
+            2
         };
         let center = min + (max - min) / 2.0;
         let reach = |&emitter: &u32| {

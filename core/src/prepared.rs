@@ -696,8 +696,6 @@ fn check(view: &View<'_>) -> Result<(), &'static str> {
     }
     ensure(view.vertices.iter().all(|vertex| finite(vertex)), "a vertex")?;
     let vertices = |indices: &[u32]| indices.iter().all(|&k| (k as usize) < view.vertices.len());
-    let vertices_or_none =
-        |emitter: &EmitterRecord| emitter.is_sphere() || vertices(&emitter.vertices);
     let material = |index: u32| (index as usize) < view.materials.len();
     let plane = |index: PlaneIndex| index.index() < view.planes.len();
     for face in view.triangles {
@@ -742,9 +740,19 @@ fn check(view: &View<'_>) -> Result<(), &'static str> {
         let end = light.touches_first as usize + light.touches_count as usize;
         ensure(end <= view.touches.len(), "a light")?;
     }
+    check_emitters(view)
+}
+
+/// What those rely on who aim at emitters.
+fn check_emitters(view: &View<'_>) -> Result<(), &'static str> {
+    let ensure = |holds: bool, what: &'static str| if holds { Ok(()) } else { Err(what) };
+    let finite = |numbers: &[f64]| numbers.iter().all(|x| x.is_finite() && x.abs() < 1e100);
+    let vertices = |emitter: &EmitterRecord| {
+        emitter.vertices.iter().all(|&k| (k as usize) < view.vertices.len()) || emitter.is_sphere()
+    };
     for emitter in view.emitters {
         let is_shape = finite(&emitter.place) && finite(&[emitter.size]) && emitter.size > 0.0;
-        let is_known = emitter.shape <= EmitterRecord::SPHERE && vertices_or_none(emitter);
+        let is_known = emitter.shape <= EmitterRecord::SPHERE && vertices(emitter);
         let is_light = emitter.radiosity.iter().all(|&x| (0.0..=1e100).contains(&x));
         ensure(is_shape && is_known && is_light, "an emitter")?;
     }
@@ -754,7 +762,5 @@ fn check(view: &View<'_>) -> Result<(), &'static str> {
         let is_ball = finite(&node.center) && numbers.iter().all(|&x| (0.0..=1e100).contains(&x));
         ensure(is_ball, "a node of emitters")?;
     }
-    emitter_tree::check_tree(view.emitter_nodes, view.emitters)
-        .map_err(|()| "the tree of emitters")?;
-    Ok(())
+    emitter_tree::check_tree(view.emitter_nodes, view.emitters).map_err(|()| "the tree of emitters")
 }
