@@ -127,6 +127,11 @@ pub(crate) struct RenderArgs {
     #[command(flatten)]
     pub(crate) picture: PictureArgs,
 
+    /// Make the picture as good as this many seconds allow: a pilot chooses the --error and the
+    /// --max-samples, and tells them.
+    #[arg(long, value_name = "S", value_parser = parse_seconds, conflicts_with_all = ["samples", "error", "max_samples"])]
+    pub(crate) time: Option<Duration>,
+
     /// Worker processes; 0 renders in this one. Default: 2, or 1 on a single core.
     #[arg(long, value_name = "N", value_parser = value_parser!(u16).range(0..=256))]
     workers: Option<u16>,

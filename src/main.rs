@@ -8,6 +8,7 @@ mod coordinator;
 mod failure;
 mod local;
 mod output;
+mod pilot;
 mod render;
 mod source;
 mod submit;

@@ -30,6 +30,7 @@ use crate::{
     failure::Failure,
     local,
     output::Output,
+    pilot,
     source::{SceneText, scene_folder},
 };
 
@@ -98,13 +99,47 @@ pub(crate) async fn run(
     let mut output = args.picture.output().map_err(Failure::Input)?;
     output.check()?;
     let text = SceneText::read(&args.picture.scene, stop).await?;
-    let order = place(&args.picture, &output, text, console, stop).await?;
+    let mut order = place(&args.picture, &output, text, console, stop).await?;
+    if let Some(time) = args.time {
+        order = choose_quality(order, time, &args, stop).await?;
+    }
     let summary = match args.workers_and_threads() {
         (0, threads) => render_here(order, threads, &args, &output, console, stop).await?,
         workers => render_with_workers(order, workers, &args, &output, console, stop).await?,
     };
     summary.tell(started, &output)?;
+    if let Some(time) = args.time {
+        let over = summary.rendering.as_secs_f64() / time.as_secs_f64() - 1.0;
+        tracing::info!(
+            over_percent = (100.0 * over).round(),
+            "rendered in {:.2} s where {:.2} s were allowed",
+            summary.rendering.as_secs_f64(),
+            time.as_secs_f64()
+        );
+    }
     Ok(())
+}
+
+/// Chooses the quality for a picture that may take that long.
+async fn choose_quality(
+    order: Order,
+    time: Duration,
+    args: &RenderArgs,
+    stop: &CancellationToken,
+) -> Result<Order, Failure> {
+    let (workers, threads) = args.workers_and_threads();
+    let (isa, stop) = (args.isa.0, stop.clone());
+    let choosing = spawn_blocking(move || {
+        let chosen = pilot::choose(&order, (workers.max(1) * threads, isa), time, &stop);
+        chosen.map(|chosen| (order, chosen))
+    });
+    let (mut order, chosen) = choosing.await??;
+    let sampling = chosen.ok_or(Failure::Interrupted)?;
+    order.settings.quality.sampling = sampling;
+    if let Sampling::Adaptive { error, most } = sampling {
+        tracing::info!("the same picture again: --error {error} --max-samples {most}");
+    }
+    Ok(order)
 }
 
 /// Reads and prepares the scene, and tells its diagnostics.

@@ -232,8 +232,11 @@ fn check_each_tile_once(log: &str, tile_count: usize) {
 fn pictures_do_not_depend_on_workers_threads_and_tiles() {
     let place = Place::new();
     for size in ["96x64", "101x67", "31x131"] {
-        for output in ["out.png", "out.exr"] {
-            let common = ["--size", size, "--samples", "3"];
+        for (output, quality) in
+            [("out.png", "--samples=3"), ("out.exr", "--error=0.02 --max-samples=32")]
+        {
+            let quality: Vec<&str> = quality.split(' ').collect();
+            let common = [&["--size", size], &quality[..]].concat();
             let expected = place
                 .render(output, &[&common[..], &["--workers", "0", "--threads", "2"]].concat());
             for (workers, threads) in [("1", ["1", "3"]), ("2", ["1", "2"]), ("5", ["1", "2"])] {
@@ -246,6 +249,18 @@ fn pictures_do_not_depend_on_workers_threads_and_tiles() {
         }
     }
     place.check_nothing_is_left();
+}
+
+#[test]
+fn a_picture_in_a_given_time_can_be_had_again() {
+    let place = Place::new();
+    let common = ["--size", "64x48", "--workers", "0", "--threads", "1"];
+    let timed = place.render("out.png", &[&common[..], &["--time", "0.5"]].concat());
+    let log = fs::read_to_string(place.path("log")).unwrap();
+    let told = log.lines().find_map(|line| line.split_once("the same picture again: "));
+    let quality: Vec<&str> = told.unwrap_or_else(|| panic!("{log}")).1.split(' ').collect();
+    assert!(log.contains("where 0.50 s were allowed"), "{log}");
+    assert!(place.render("out.png", &[&common[..], &quality].concat()) == timed, "{quality:?}");
 }
 
 #[test]
@@ -445,6 +460,8 @@ fn bad_input_gives_one_clear_line_and_an_exit_code() {
         ("scene.rt", "o.png", "--size=1e3x5", 2, "a size looks like 1280x720"),
         ("scene.rt", "o.png", "--tile=2", 2, "2 is not in 4..=1024"),
         ("scene.rt", "o.png", "--samples=0", 2, "0 is not in 1..=65536"),
+        ("scene.rt", "o.png", "--error=0", 2, "an error is above 0 and at most 1"),
+        ("scene.rt", "o.png", "--max-samples=7", 2, "7 is not in 8..=65536"),
         ("scene.rt", "o.png", "--isa=mmx", 2, "`mmx` is not an instruction set"),
         ("scene.rt", "o.png", "--wokers=2", 2, "unexpected argument '--wokers'"),
     ] {

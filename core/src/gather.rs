@@ -10,7 +10,7 @@ use crate::{
     ray::{Hit, Ray},
     sample::Sample,
     trace::{self, trace},
-    wavefront::{Point, face_normal},
+    wavefront::{Point, face_normal, surface_color},
 };
 
 /// The most faces that let light through on one ray: far more than any scene has, so that
@@ -108,6 +108,8 @@ impl Gatherer {
             if weight > 0.0 {
                 let outward = face_normal(view, hit, position);
                 let is_front = outward.dot(ray.direction) <= 0.0;
+                // A texture's truth: a mean over all samples needs no coarser level.
+                let finest = Some([DVec3::ZERO; 2]);
                 self.sources.push(Point {
                     sample: seeker.point,
                     node: 0,
@@ -115,7 +117,7 @@ impl Gatherer {
                     position,
                     normal: if is_front { outward } else { -outward },
                     surface,
-                    color: DVec3::from_array(material.color),
+                    color: surface_color(view, material, hit, (position, outward), finest),
                     light: DVec3::from_array(view.header.lighting.ambient),
                 });
             }

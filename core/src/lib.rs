@@ -31,6 +31,7 @@ mod node;
 mod plane;
 pub mod prepare;
 pub mod prepared;
+mod pyramid;
 mod weld;
 
 // A prepared scene into tiles.
@@ -45,6 +46,9 @@ pub mod render;
 pub mod sample;
 mod solid;
 mod sphere;
+mod spread;
+mod texcoord;
+mod texture_sampling;
 pub mod tile;
 pub mod trace;
 mod triangle;

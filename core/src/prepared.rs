@@ -13,15 +13,18 @@ use glam::DVec3;
 use crate::{
     bvh, emitter_tree,
     node::{Child, Frame, Node},
+    pyramid::{LevelRecord, TextureRecord},
     ray::{Item, Kind, Surface},
     scene::{Material, Sphere},
     solid::{self, NodeRecord},
+    texcoord::Texcoords,
+    texture_sampling::TextureView,
 };
 
 const MAGIC: [u8; 8] = *b"rtfarm\r\n";
 
 /// Changes with the layout or the meaning of any byte.
-const VERSION: u32 = 3;
+const VERSION: u32 = 4;
 
 /// Reads differently on a machine of the other byte order.
 const BYTE_ORDER: u32 = 0x0102_0304;
@@ -81,7 +84,8 @@ pub(crate) struct Features {
     pub(crate) has_solids: u32,
     /// Faces send light on to others: [`Features::AIMED`] or [`Features::UNAIMED`].
     pub(crate) has_emitters: u32,
-    pub(crate) padding: u32,
+    /// A face shows an image.
+    pub(crate) has_textures: u32,
 }
 
 impl Features {
@@ -290,12 +294,18 @@ pub(crate) struct MaterialRecord {
     pub(crate) alpha: f64,
     /// n1/n2 from the front; 0 and 1 do not bend.
     pub(crate) refract: f64,
+    /// The image that multiplies `color` on faces with texture coordinates, or [`Self::PLAIN`].
+    pub(crate) texture: u32,
+    padding: u32,
 }
 
 impl MaterialRecord {
-    pub(crate) fn new(material: &Material) -> Self {
+    /// No texture.
+    pub(crate) const PLAIN: u32 = u32::MAX;
+
+    pub(crate) fn new(material: &Material, texture: u32) -> Self {
         let Material { color, reflect, alpha, refract, .. } = *material;
-        Self { color: color.to_array(), reflect, alpha, refract }
+        Self { color: color.to_array(), reflect, alpha, refract, texture, padding: 0 }
     }
 
     /// Whether faces send light on to others.
@@ -398,6 +408,21 @@ impl EmitterNode {
     }
 }
 
+/// The texture coordinates of a face.
+#[derive(Debug, Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
+#[repr(C)]
+pub(crate) struct TexturedFace {
+    pub(crate) texcoords: Texcoords,
+    pub(crate) rank: u32,
+    padding: u32,
+}
+
+impl TexturedFace {
+    pub(crate) fn new(rank: u32, texcoords: Texcoords) -> Self {
+        Self { texcoords, rank, padding: 0 }
+    }
+}
+
 /// Declares the sections of a block, once for all that go through them in order.
 macro_rules! sections {
     ($($name:ident: $record:ty,)*) => {
@@ -443,6 +468,11 @@ sections! {
     first_ranks: u32,
     emitters: EmitterRecord,
     emitter_nodes: EmitterNode,
+    textured_faces: TexturedFace,
+    textures: TextureRecord,
+    texture_levels: LevelRecord,
+    fine_texels: [u8; 4],
+    coarse_texels: [f32; 3],
 }
 
 /// A block as the tracer reads it.
@@ -487,6 +517,15 @@ impl<'a> View<'a> {
         match self.first_ranks.partition_point(|&first| first <= rank).checked_sub(1) {
             Some(primitive) => (primitive as u32, rank - self.first_ranks[primitive]),
             None => (rank, 0),
+        }
+    }
+
+    /// An image with its levels.
+    pub(crate) fn texture(&self, index: u32) -> TextureView<'a> {
+        TextureView {
+            levels: &self.texture_levels[self.textures[index as usize].levels()],
+            fine: self.fine_texels,
+            coarse: self.coarse_texels,
         }
     }
 
@@ -721,6 +760,8 @@ fn check(view: &View<'_>) -> Result<(), &'static str> {
         let is_share = |x: f64| (0.0..=1.0).contains(&x);
         let whole = finite(&record.color) && finite(&numbers) && record.refract >= 0.0;
         ensure(whole && is_share(record.reflect) && is_share(record.alpha), "a material")?;
+        let has_texture = (record.texture as usize) < view.textures.len();
+        ensure(has_texture || record.texture == MaterialRecord::PLAIN, "a material")?;
     }
     for leaf in view.leaves {
         let whole = finite(&leaf.center) && finite(&[leaf.radius]) && material(leaf.material);
@@ -740,7 +781,27 @@ fn check(view: &View<'_>) -> Result<(), &'static str> {
         let end = light.touches_first as usize + light.touches_count as usize;
         ensure(end <= view.touches.len(), "a light")?;
     }
+    check_textures(view)?;
     check_emitters(view)
+}
+
+/// What those rely on who look at textures.
+fn check_textures(view: &View<'_>) -> Result<(), &'static str> {
+    let ensure = |holds: bool, what: &'static str| if holds { Ok(()) } else { Err(what) };
+    let finite = |numbers: &[f64]| numbers.iter().all(|x| x.is_finite() && x.abs() < 1e100);
+    let is_sorted = view.textured_faces.is_sorted_by(|a, b| a.rank < b.rank);
+    ensure(is_sorted, "the textured faces' order")?;
+    let texcoords = |face: &TexturedFace| finite(face.texcoords.0.as_flattened());
+    ensure(view.textured_faces.iter().all(texcoords), "a texture coordinate")?;
+    for texture in view.textures {
+        let levels = view.texture_levels.get(texture.levels()).ok_or("a texture")?;
+        let (finest, coarser) = levels.split_first().ok_or("a texture")?;
+        ensure(finest.lies_within(view.fine_texels.len()), "a texture")?;
+        let are_within = coarser.iter().all(|level| level.lies_within(view.coarse_texels.len()));
+        ensure(are_within, "a texture's level")?;
+    }
+    let texels = view.coarse_texels.as_flattened();
+    ensure(texels.iter().all(|channel| (0.0..=1.0).contains(channel)), "a texel")
 }
 
 /// What those rely on who aim at emitters.

@@ -11,10 +11,12 @@ use glam::DVec3;
 use crate::{
     gather::Gatherer,
     isa::Isa,
-    prepared::{Camera, PlaneIndex, View},
+    prepared::{MaterialRecord, PlaneIndex, View},
     ray::{Hit, Kind, Ray, Surface},
     render::{Quality, Settings},
     sample::{Sample, node_after},
+    spread::Spread,
+    texture_sampling::texture_color,
     trace::{self, trace, trace_shadows},
     triangle::triangle_normal,
 };
@@ -31,6 +33,8 @@ pub(crate) struct CameraSample {
     pub(crate) y: u32,
     /// Its random numbers.
     pub(crate) sample: Sample,
+    /// The width of the square that it stands for, in pixels.
+    pub(crate) spread: f64,
 }
 
 /// Samples on their way, and the queues that they pass through.
@@ -41,6 +45,8 @@ pub(crate) struct Batch {
     /// The rays of the current depth, and what each adds to.
     rays: Vec<Ray>,
     branches: Vec<Branch>,
+    /// What each ray's sample is wide; empty in a scene without textures.
+    spreads: Vec<Spread>,
     hits: Vec<Hit>,
     points: Vec<Point>,
     shadow_rays: Vec<Ray>,
@@ -50,6 +56,7 @@ pub(crate) struct Batch {
     next_rays: Vec<Ray>,
     next_branches: Vec<Branch>,
     gatherer: Gatherer,
+    next_spreads: Vec<Spread>,
     /// What each sample sees.
     pub(crate) colors: Vec<DVec3>,
     /// Of each sample, the weights of the branches that were not traced.
@@ -87,20 +94,27 @@ impl Batch {
     /// Queues the camera rays of `samples`.
     pub(crate) fn start(
         &mut self,
-        camera: &Camera,
+        view: &View<'_>,
         settings: &Settings,
         samples: impl Iterator<Item = CameraSample>,
     ) {
-        let size = settings.size;
+        let (size, camera) = (settings.size, &view.header.camera);
+        let has_textures = view.header.features.has_textures == 1;
         let screen = [camera.top_left, camera.right, camera.down].map(DVec3::from_array);
         self.rays.clear();
         self.samples.clear();
-        self.rays.extend(samples.map(|CameraSample { x, y, sample }| {
+        self.spreads.clear();
+        self.rays.extend(samples.map(|CameraSample { x, y, sample, spread }| {
             self.samples.push(sample);
             let [across, down] = sample.position();
             let u = (f64::from(x) + across) / f64::from(size.width());
             let v = (f64::from(y) + down) / f64::from(size.height());
             let direction = screen[0] + u * screen[1] + v * screen[2];
+            if has_textures {
+                let steps = [(1, size.width()), (2, size.height())]
+                    .map(|(side, count)| screen[side] * (spread / f64::from(count)));
+                self.spreads.push(Spread::of_camera(direction, steps));
+            }
             Ray {
                 origin: DVec3::from_array(camera.eye),
                 direction: direction / direction.length(),
@@ -141,10 +155,11 @@ impl Batch {
             self.points.clear();
             self.next_rays.clear();
             self.next_branches.clear();
+            self.next_spreads.clear();
             for index in 0..self.rays.len() {
-                let (ray, hit, branch) = (self.rays[index], self.hits[index], self.branches[index]);
-                if hit.is_some() {
-                    self.meet(view, &ray, &hit, branch, quality.cutoff, depth);
+                let branch = self.branches[index];
+                if self.hits[index].is_some() {
+                    self.meet(view, index, quality.cutoff, depth);
                 } else {
                     self.colors[branch.sample] += branch.weight * background;
                 }
@@ -158,6 +173,7 @@ impl Batch {
             }
             std::mem::swap(&mut self.rays, &mut self.next_rays);
             std::mem::swap(&mut self.branches, &mut self.next_branches);
+            std::mem::swap(&mut self.spreads, &mut self.next_spreads);
             depth += 1;
         }
         for (color, cut) in self.colors.iter_mut().zip(&self.cut) {
@@ -166,16 +182,10 @@ impl Batch {
         ControlFlow::Continue(ray_count)
     }
 
-    /// A ray has met a face: queues what its own light and its branches need.
-    fn meet(
-        &mut self,
-        view: &View<'_>,
-        ray: &Ray,
-        hit: &Hit,
-        Branch { sample, weight, node }: Branch,
-        cutoff: f64,
-        depth: u32,
-    ) {
+    /// Ray `index` has met a face: queues what its own light and its branches need.
+    fn meet(&mut self, view: &View<'_>, index: usize, cutoff: f64, depth: u32) {
+        let (ray, hit) = (&self.rays[index], &self.hits[index]);
+        let Branch { sample, weight, node } = self.branches[index];
         let position = ray.origin + hit.t * ray.direction;
         let outward = face_normal(view, hit, position);
         let is_front = outward.dot(ray.direction) <= 0.0;
@@ -183,7 +193,10 @@ impl Batch {
         let surface = trace::surface(view, hit.item, hit.part);
         let material = &view.materials[trace::material(view, hit.item, hit.part) as usize];
         let (reflect, alpha) = (material.reflect, material.alpha);
+        let spread =
+            self.spreads.get(index).map(|spread| spread.transfer(ray.direction, hit.t, normal));
         if reflect < 1.0 && alpha > 0.0 {
+            let steps = spread.map(|spread| spread.origin);
             self.points.push(Point {
                 sample,
                 node,
@@ -191,31 +204,35 @@ impl Batch {
                 position,
                 normal,
                 surface,
-                color: DVec3::from_array(material.color),
+                color: surface_color(view, material, hit, (position, outward), steps),
                 light: DVec3::from_array(view.header.lighting.ambient),
             });
         }
         if view.header.features.has_branches == 0 {
             return;
         }
-        let mut follow = |direction: DVec3, after: u32, weight: f64, branch: u64| {
-            if weight < cutoff || depth == DEEPEST {
-                self.cut[sample] += weight;
-                return;
-            }
-            self.next_rays.push(Ray {
-                origin: position,
-                direction,
-                reach: f64::INFINITY,
-                leaving: surface,
-                after,
-            });
-            self.next_branches.push(Branch { sample, weight, node: node_after(node, branch) });
-        };
+        let mut follow =
+            |direction: DVec3, after: u32, weight: f64, branch: u64, spread: Option<Spread>| {
+                if weight < cutoff || depth == DEEPEST {
+                    self.cut[sample] += weight;
+                    return;
+                }
+                self.next_rays.push(Ray {
+                    origin: position,
+                    direction,
+                    reach: f64::INFINITY,
+                    leaving: surface,
+                    after,
+                });
+                self.next_branches.push(Branch { sample, weight, node: node_after(node, branch) });
+                self.next_spreads.extend(spread);
+            };
         let cosine = -normal.dot(ray.direction);
         let mirrored = mirror(ray.direction, normal, cosine);
+        let curvature = if spread.is_some() { curvature(view, hit, position, normal) } else { 0.0 };
+        let mirrored_spread = spread.map(|spread| spread.mirror(ray.direction, normal, curvature));
         if reflect > 0.0 {
-            follow(mirrored, Ray::NOTHING_AHEAD, weight * reflect, 1);
+            follow(mirrored, Ray::NOTHING_AHEAD, weight * reflect, 1, mirrored_spread);
         }
         if reflect < 1.0 && alpha < 1.0 {
             let weight = weight * ((1.0 - reflect) * (1.0 - alpha));
@@ -227,8 +244,14 @@ impl Batch {
                 refract(ray.direction, normal, cosine, ratio)
             };
             match bent {
-                Some(direction) => follow(direction, hit.rank, weight, 2),
-                None => follow(mirrored, Ray::NOTHING_AHEAD, weight, 2), // Total reflection.
+                Some(direction) => {
+                    let refract =
+                        |spread: Spread| spread.refract(ray.direction, normal, curvature, ratio);
+                    let bent = if is_straight { spread } else { spread.map(refract) };
+                    follow(direction, hit.rank, weight, 2, bent);
+                }
+                // Total reflection.
+                None => follow(mirrored, Ray::NOTHING_AHEAD, weight, 2, mirrored_spread),
             }
         }
     }
@@ -284,6 +307,24 @@ impl Batch {
     }
 }
 
+/// The colour of a face at a hit, its texture included, which is seen through a footprint that is
+/// `steps` wide along the face. They are none in a scene without textures.
+pub(crate) fn surface_color(
+    view: &View<'_>,
+    material: &MaterialRecord,
+    hit: &Hit,
+    at: (DVec3, DVec3),
+    steps: Option<[DVec3; 2]>,
+) -> DVec3 {
+    let color = DVec3::from_array(material.color);
+    match steps {
+        Some(steps) if material.texture != MaterialRecord::PLAIN => {
+            color * texture_color(view, material.texture, hit, at, steps)
+        }
+        _ => color,
+    }
+}
+
 /// The direction of mirrored light; `cosine` is that between the normal and where it came from.
 fn mirror(direction: DVec3, normal: DVec3, cosine: f64) -> DVec3 {
     let mirrored = direction + 2.0 * cosine * normal;
@@ -298,6 +339,25 @@ fn refract(direction: DVec3, normal: DVec3, cosine: f64, ratio: f64) -> Option<D
         let bent = ratio * direction + (ratio * cosine - square.sqrt()) * normal;
         bent / bent.length()
     })
+}
+
+/// By how much a step along what a ray hit turns its `normal`, per unit of the step: 0 on a flat
+/// face, below 0 on a sphere that is seen from within.
+fn curvature(view: &View<'_>, hit: &Hit, position: DVec3, normal: DVec3) -> f64 {
+    let index = hit.item.index();
+    let center = match hit.item.kind() {
+        Some(Kind::Sphere) => view.spheres[index].center,
+        Some(Kind::Solid) => {
+            let leaf = &view.solid_leaves(&view.solids[index])[hit.part as usize / 6];
+            if !leaf.is_sphere() {
+                return 0.0;
+            }
+            leaf.center
+        }
+        _ => return 0.0,
+    };
+    let from_center = position - DVec3::from_array(center);
+    normal.dot(from_center) / from_center.length_squared()
 }
 
 /// The unit normal towards the front of what a ray hit.

@@ -2,13 +2,16 @@
 
 #![expect(clippy::float_cmp, reason = "what holds exactly is tested exactly")]
 
+mod parts;
 mod studio;
 
 use std::fmt::Write;
 
 use glam::DVec3;
+use parts::{join, rays, sphere, upright};
 use rtfarm_core::{
     isa::Isa,
+    prepared::{PreparedBytes, PreparedScene},
     scene::{Quadrangle, Scene, Sphere},
     trace::Probe,
 };
@@ -38,11 +41,6 @@ fn lamp(x: f64, y: f64, z: f64) -> String {
     format!("point coords {x:?} {y:?} {z:?} power 1 endpoint ")
 }
 
-fn sphere(center: DVec3, radius: f64, material: &str) -> String {
-    let [x, y, z] = center.to_array();
-    format!("sphere coords {x:?} {y:?} {z:?} radius {radius:?} material {material} endsphere ")
-}
-
 /// A triangle or a quadrangle.
 fn polygon(corners: &[DVec3], material: &str) -> String {
     let word = if corners.len() == 3 { "triangle" } else { "quadrangle" };
@@ -57,6 +55,11 @@ fn polygon(corners: &[DVec3], material: &str) -> String {
 fn wall(z: f64, half: f64, material: &str) -> String {
     let corner = |x: f64, y: f64| DVec3::new(x * half, y * half, z);
     polygon(&[corner(-1.0, -1.0), corner(1.0, -1.0), corner(1.0, 1.0), corner(-1.0, 1.0)], material)
+}
+
+/// The side of a picture that takes this many rays, or more if asked for.
+fn side(count: usize) -> u64 {
+    rays(count).isqrt() as u64
 }
 
 /// What a pixel's middle sees: the point on the sphere.
@@ -144,6 +147,7 @@ fn a_light_on_a_surface_still_lights_what_faces_it() {
 #[test]
 fn a_light_inside_an_opaque_sphere_leaves_all_outside_exactly_dark() {
     let mut random = Random::new(2);
+    let side = side(10_000 / 4);
     for seed in 0..30 {
         let (center, radius) = (random.in_cube() * 0.3, random.between(0.2, 1.0));
         // From the middle to a hair's breadth under the skin.
@@ -151,7 +155,7 @@ fn a_light_inside_an_opaque_sphere_leaves_all_outside_exactly_dark() {
         let light = center + random.direction() * radius * depth;
         let geometry = wall(-1.5, 9.0, "white") + &sphere(center, radius, "white");
         let scene = scene(&lamp(light.x, light.y, light.z), &geometry);
-        for (k, pixel) in picture(&scene, &settings(48, 48, 4)).into_iter().enumerate() {
+        for (k, pixel) in picture(&scene, &settings(side, side, 4)).into_iter().enumerate() {
             assert_eq!(pixel, BLACK, "{seed}: pixel {k}");
         }
     }
@@ -160,17 +164,82 @@ fn a_light_inside_an_opaque_sphere_leaves_all_outside_exactly_dark() {
 #[test]
 fn a_light_inside_an_opaque_sphere_lights_all_of_its_inside() {
     let mut random = Random::new(3);
+    let side = side(10_000);
     for seed in 0..10 {
         let center = DVec3::new(0.0, 0.0, 5.0) + random.in_cube() * 0.3;
         let light = center + random.in_cube() * 0.5;
         let scene = scene(&lamp(light.x, light.y, light.z), &sphere(center, 1.5, "white"));
-        for (k, pixel) in picture(&scene, &settings(48, 48, 1)).into_iter().enumerate() {
-            let point = point_on_sphere(&scene, 48, k, &scene.spheres[0]).unwrap();
+        for (k, pixel) in picture(&scene, &settings(side, side, 1)).into_iter().enumerate() {
+            let point = point_on_sphere(&scene, side as u32, k, &scene.spheres[0]).unwrap();
             let truth = irradiance(light, point, (center - point).normalize());
             let error = (f64::from(pixel[0]) - truth).abs() / truth;
             assert!(error < 1e-6, "{seed}: pixel {k} is {pixel:?}, truly {truth}");
         }
     }
+}
+
+/// Opaque shells around a cavity that holds `middle`, told by name.
+fn shells(middle: DVec3) -> Vec<(&'static str, String)> {
+    let ball = |radius: f64| sphere(middle, radius, "white");
+    let cube = |half: f64| upright(middle - half, middle + half, "white");
+    let lid = upright(middle - 1.2, middle + DVec3::new(1.2, 0.1, 1.2), "white");
+    let rest = upright(middle - DVec3::new(1.2, 0.1, 1.2), middle + 1.2, "white");
+    vec![
+        ("ball in ball", join("difference", &[&ball(1.2), &ball(0.9)])),
+        ("ball in box", join("difference", &[&cube(1.2), &ball(0.9)])),
+        ("box in ball", join("difference", &[&ball(1.6), &cube(0.9)])),
+        ("box in box", join("difference", &[&cube(1.2), &cube(0.9)])),
+        ("two halves", join("difference", &[&join("union", &[&lid, &rest]), &ball(0.9)])),
+    ]
+}
+
+#[test]
+fn a_light_inside_a_shell_of_a_solid_leaves_all_outside_exactly_dark() {
+    let mut random = Random::new(12);
+    let side = side(1000);
+    let mut count = 0;
+    for seed in 0..20 {
+        let middle = random.in_cube() * 0.3;
+        for (what, shell) in shells(middle) {
+            // From the middle to a hair's breadth before the wall, and inside the wall.
+            let depth = [0.0, 0.5, 1.0 - 1e-9, 1.0 - 1e-12, 1.1][seed % 5];
+            let light = middle + DVec3::AXES[seed % 3] * 0.9 * depth * random.sign();
+            let geometry = wall(-3.0, 9.0, "white") + &shell;
+            let scene = scene(&lamp(light.x, light.y, light.z), &geometry);
+            for (k, pixel) in picture(&scene, &settings(side, side, 1)).into_iter().enumerate() {
+                assert_eq!(pixel, BLACK, "{what}, {seed}: pixel {k}");
+                count += 1;
+            }
+        }
+    }
+    eprintln!("{count} places outside are exactly dark");
+}
+
+#[test]
+fn a_light_inside_a_shell_of_a_solid_lights_all_of_its_inside() {
+    let mut random = Random::new(13);
+    let side = side(2000);
+    let (mut count, mut worst) = (0, 0.0_f64);
+    for seed in 0..10 {
+        let middle = DVec3::new(0.0, 0.0, 5.0) + random.in_cube() * 0.2;
+        let light = middle + random.in_cube() * 0.4;
+        for (what, shell) in shells(middle) {
+            let scene = scene(&lamp(light.x, light.y, light.z), &shell);
+            let cavity = Sphere { center: middle, radius: 0.9, material: 0, primitive: 0 };
+            let settings = settings(side, side, 1);
+            for (k, pixel) in picture(&scene, &settings).into_iter().enumerate() {
+                assert!(pixel[0] > 0.0, "{what}, {seed}: pixel {k} is dark");
+                count += 1;
+                if shell.contains("radius 0.9") {
+                    let point = point_on_sphere(&scene, side as u32, k, &cavity).unwrap();
+                    let truth = irradiance(light, point, (middle - point).normalize());
+                    worst = worst.max((f64::from(pixel[0]) - truth).abs() / truth);
+                }
+            }
+        }
+    }
+    eprintln!("{count} places inside are lit; in round cavities right within {worst:.1e}");
+    assert!(worst < 1e-6);
 }
 
 #[test]
@@ -431,4 +500,161 @@ fn pictures_may_be_one_pixel_or_as_wide_as_can_be() {
         let last = pixels(&prepared(&scene), &settings(width, height, 1), corner);
         assert_eq!(last, [BLACK]);
     }
+}
+
+/// A sphere of some size somewhere, alone or the only part of a solid.
+struct Ball {
+    block: PreparedScene<PreparedBytes>,
+    center: DVec3,
+    radius: f64,
+    /// How far off its place rounding may put a point on it, in radii.
+    blur: f64,
+    is_solid: bool,
+}
+
+fn balls(random: &mut Random) -> Vec<Ball> {
+    let ball = |k: usize| {
+        let center = random.in_cube() * [0.0, 1.0, 1e3, 1e6][k % 4];
+        let radius = random.log_uniform(1e-3, 1e3);
+        let is_solid = k % 8 >= 4;
+        let mut geometry = sphere(center, radius, "white");
+        if is_solid {
+            let around = upright(center - 2.0 * radius, center + 2.0 * radius, "red");
+            geometry = join("intersection", &[&geometry, &around]);
+        }
+        let block = prepared(&scene("", &geometry));
+        // A solid's crossings are told apart on the scale of the whole scene, with its eye at 5.
+        let scale = center.abs().max_element().max(if is_solid { 8.0 } else { 0.0 });
+        let blur = 16.0 * f64::EPSILON * (1.0 + scale / radius);
+        Ball { block, center, radius, blur, is_solid }
+    };
+    (0..40).map(ball).collect()
+}
+
+#[test]
+fn a_ray_from_inside_a_sphere_goes_out_once() {
+    let mut random = Random::new(16);
+    let (mut count, mut worst) = (0, 0.0_f64);
+    for ball in balls(&mut random) {
+        let probes: Vec<Probe> = (0..rays(100_000) / 40)
+            .map(|k| {
+                // Down to where rounding would put it outside.
+                let depth = random.log_uniform(4.0 * ball.blur, 1.0);
+                let share = if k % 2 == 0 { 1.0 - depth } else { random.unit() * (1.0 - depth) };
+                let origin = ball.center + random.direction() * ball.radius * share;
+                Probe { origin, direction: random.direction(), leaving: None }
+            })
+            .collect();
+        assert!(ball.block.count_crossings(&probes).into_iter().all(|crossings| crossings == 1));
+        for (probe, hit) in probes.iter().zip(ball.block.probe(&probes, Isa::fastest())) {
+            let hit = hit.unwrap_or_else(|| panic!("{probe:?} never leaves"));
+            let point = probe.origin + hit.t * probe.direction;
+            let height = (point.distance(ball.center) / ball.radius - 1.0).abs();
+            worst = worst.max(height / ball.blur);
+            let leaving = Some((hit.primitive, hit.face));
+            let on = Probe { origin: point, leaving, ..*probe };
+            assert_eq!(ball.block.probe(&[on], Isa::fastest()), [None], "{probe:?}");
+            count += 1;
+        }
+    }
+    eprintln!("{count} rays go out once, at {:.1} ulp of the sphere or nearer", 16.0 * worst);
+    assert!(worst < 1.0);
+}
+
+/// Rays that start on spheres, from the places that the tracer finds there, and how fast each goes
+/// outwards: from straight out to all but along the sphere.
+fn starts_on(ball: &Ball, random: &mut Random, count: usize, ahead: f64) -> Vec<(Probe, f64)> {
+    let outside: Vec<Probe> = (0..count)
+        .map(|_| {
+            let target = ball.center + random.in_cube() * ball.radius * 0.57;
+            let origin = ball.center + random.direction() * ball.radius * 5.0;
+            Probe { origin, direction: (target - origin).normalize(), leaving: None }
+        })
+        .collect();
+    let hits = ball.block.probe(&outside, Isa::fastest());
+    let start = |(probe, hit): (&Probe, Option<rtfarm_core::trace::ProbeHit>)| {
+        let hit = hit.expect("a ray at the middle of a ball");
+        let origin = probe.origin + hit.t * probe.direction;
+        let outward = (origin - ball.center).normalize();
+        let aside = outward.any_orthonormal_vector();
+        // Where the ends of a solid's stretch cannot be told apart it is nothing.
+        let least = if ball.is_solid { ball.blur.sqrt() } else { 1e-15 };
+        let sine = random.log_uniform(least, 1.0);
+        let cosine = ((1.0 - sine) * (1.0 + sine)).sqrt();
+        let direction = (ahead * sine * outward + cosine * aside).normalize();
+        let leaving = Some((hit.primitive, hit.face));
+        (Probe { origin, direction, leaving }, (origin - ball.center).dot(direction))
+    };
+    outside.iter().zip(hits).map(start).collect()
+}
+
+#[test]
+fn a_ray_that_leaves_a_sphere_outwards_never_meets_it_again() {
+    let mut random = Random::new(17);
+    let (mut count, mut grazing) = (0, 0);
+    for ball in balls(&mut random) {
+        let starts = starts_on(&ball, &mut random, rays(100_000) / 40, 1.0);
+        let probes: Vec<Probe> =
+            starts.iter().filter(|start| start.1 >= 0.0).map(|start| start.0).collect();
+        let hits = ball.block.probe(&probes, Isa::fastest());
+        let self_hits = hits.iter().filter(|hit| hit.is_some()).count();
+        assert_eq!(self_hits, 0, "of a radius of {} at {}", ball.radius, ball.center);
+        count += probes.len();
+        grazing += starts.iter().filter(|start| start.1.abs() < 1e-6 * ball.radius).count();
+    }
+    eprintln!("0 of {count} rays meet the sphere that they leave, {grazing} of them graze it");
+    assert!(count > rays(95_000));
+}
+
+#[test]
+fn a_ray_that_leaves_a_sphere_inwards_always_meets_its_other_side() {
+    let mut random = Random::new(18);
+    let (mut count, mut worst) = (0, 0.0_f64);
+    for ball in balls(&mut random) {
+        let starts = starts_on(&ball, &mut random, rays(100_000) / 40, -1.0);
+        let starts: Vec<_> = starts.into_iter().filter(|start| start.1 < 0.0).collect();
+        let probes: Vec<Probe> = starts.iter().map(|start| start.0).collect();
+        let hits = ball.block.probe(&probes, Isa::fastest());
+        let lost = hits.iter().filter(|hit| hit.is_none()).count();
+        assert_eq!(lost, 0, "of a radius of {} at {}", ball.radius, ball.center);
+        for (probe, hit) in probes.iter().zip(hits) {
+            let t = hit.expect("none is lost").t;
+            let end = (probe.origin + t * probe.direction).distance(ball.center);
+            worst = worst.max((end / ball.radius - 1.0).abs() / ball.blur);
+            assert!(t > 0.0, "{probe:?}");
+            count += 1;
+        }
+    }
+    eprintln!("0 of {count} rays are lost; they end within {:.1} ulp of the sphere", 16.0 * worst);
+    assert!(worst < 1.0);
+}
+
+#[test]
+fn a_ray_mirrored_a_thousand_times_inside_a_ball_keeps_its_chord() {
+    let mut random = Random::new(19);
+    let (mut count, mut worst) = (0, 0.0_f64);
+    for _ in 0..rays(100_000) / 1000 {
+        let (center, radius) = (random.in_cube(), random.between(0.5, 2.0));
+        let block = prepared(&scene("", &sphere(center, radius, "white")));
+        let [origin, direction] = [0.9 * radius * random.in_cube() * 0.57, random.direction()];
+        let mut ray = Probe { origin: center + origin, direction, leaving: None };
+        let chord = {
+            let aside = origin - origin.dot(direction) * direction;
+            2.0 * ((radius - aside.length()) * (radius + aside.length())).sqrt()
+        };
+        for bounce in 0..1000 {
+            let hit = block.probe(&[ray], Isa::fastest())[0].expect("a ray in a closed ball");
+            if bounce > 0 {
+                worst = worst.max((hit.t - chord).abs() / radius);
+            }
+            let origin = ray.origin + hit.t * ray.direction;
+            let normal = (origin - center).normalize();
+            let mirrored = ray.direction - 2.0 * ray.direction.dot(normal) * normal;
+            let leaving = Some((hit.primitive, hit.face));
+            ray = Probe { origin, direction: mirrored.normalize(), leaving };
+            count += 1;
+        }
+    }
+    eprintln!("{count} bounces, none lost; chords drift by {worst:.1e} of the radius");
+    assert!(worst < 1e-11);
 }

@@ -2,12 +2,15 @@
 //!
 //! `RTFARM_RAYS=100` takes a hundred times as many rays.
 
+mod judge;
 mod parts;
 
 use std::{f64::consts::PI, thread};
 
 use glam::{DMat3, DVec3};
+use judge::check_against_oracle;
 use parts::{join, parallelepiped, rays, sphere, upright};
+use rayon::prelude::*;
 use rtfarm_core::{
     isa::Isa,
     prepare::prepare,
@@ -16,7 +19,11 @@ use rtfarm_core::{
     scene::Scene,
     trace::{Probe, ProbeHit},
 };
-use rtfarm_oracle::random::Random;
+use rtfarm_oracle::{
+    Oracle,
+    random::Random,
+    random_scene::{Recipe, Style, random_scene},
+};
 
 /// Rays in a batch.
 const BATCH: usize = 10_000;
@@ -526,3 +533,256 @@ fn a_parallelepiped_has_no_cracks_at_its_edges_and_corners() {
         assert_eq!(leaks, 0, "{seed}");
     }
 }
+
+#[test]
+fn a_sheared_box_is_met_where_the_oracle_meets_it_within_its_condition() {
+    let runs = 100;
+    let worst_of_run = |run: usize| {
+        let mut random = Random::new(run as u64);
+        let condition = [1.0, 1e2, 1e4, 1e6, 1e8][run % 5];
+        let [outer, inner] = [turn(&mut random), turn(&mut random)];
+        let sizes =
+            DVec3::new(1.0, random.log_uniform(1.0 / condition / 2.0, 1.0), 1.0 / condition);
+        let edges = outer * DMat3::from_diagonal(sizes) * inner;
+        let edges = [edges.x_axis, edges.y_axis, edges.z_axis];
+        let corner = random.in_cube();
+        let box_text = parallelepiped(corner, edges, "m");
+        let text = if run.is_multiple_of(2) { box_text } else { alone(&box_text) };
+        let scene = read(&text);
+        let (block, oracle) = (opened(&text), Oracle::new(&scene));
+        let probes: Vec<Probe> = (0..rays(100_000) / runs)
+            .map(|_| {
+                let inside: DVec3 = edges.into_iter().map(|edge| edge * random.unit()).sum();
+                probe(random.direction() * 5.0, corner + inside)
+            })
+            .collect();
+        let (mut worst, mut across) = (0.0_f64, 0.0_f64);
+        for (probe, found) in probes.iter().zip(block.probe(&probes, Isa::fastest())) {
+            let what = format!("a condition of {condition:e}");
+            if !check_against_oracle((&scene, &oracle), probe, found, &what) {
+                continue;
+            }
+            let (Some(found), Some(truth)) =
+                (found, oracle.first_hit(probe.origin, probe.direction, None))
+            else {
+                continue;
+            };
+            let ulp = f64::EPSILON * truth.t.max(probe.origin.abs().max_element());
+            let (error, cosine) =
+                ((found.t - truth.t).abs() / ulp, truth.normal.dot(probe.direction).abs());
+            // Along a face that is grazed the least rounding reaches far, whatever the box.
+            if cosine > 0.5 {
+                worst = worst.max(error / condition);
+            }
+            across = across.max(error * cosine);
+        }
+        (worst, across)
+    };
+    let worst = (0..runs).into_par_iter().map(worst_of_run);
+    let (worst, across) = worst.reduce(|| (0.0, 0.0), |a, b| (a.0.max(b.0), a.1.max(b.1)));
+    eprintln!(
+        "{} rays: t is right within {worst:.2} ulp a condition, {across:.1} ulp across the face",
+        rays(100_000)
+    );
+    assert!(worst < 8.0 && across < 8.0);
+}
+
+/// The ends of what is left of one stretch of a ray where another is taken from it; a stretch that
+/// ends before it begins is empty.
+fn less(stretch: [f64; 2], taken: [f64; 2]) -> Vec<f64> {
+    let [low, high] = stretch;
+    let pieces = if taken[0] < taken[1] {
+        vec![[low, high.min(taken[0])], [low.max(taken[1]), high]]
+    } else {
+        vec![stretch]
+    };
+    pieces.into_iter().filter(|[low, high]| high - low > SHORT).flatten().collect()
+}
+
+/// Where a ray that runs in the plane across `axis` is in the rectangle of an upright box.
+fn chord(probe: &Probe, axis: usize, low: DVec3, high: DVec3) -> [f64; 2] {
+    let mut ends = [f64::NEG_INFINITY, f64::INFINITY];
+    for other in (0..3).filter(|&other| other != axis) {
+        let [a, b] = [low, high].map(|end| (end - probe.origin)[other] / probe.direction[other]);
+        ends = [ends[0].max(a.min(b)), ends[1].min(a.max(b))];
+    }
+    ends
+}
+
+#[test]
+fn a_ray_in_the_plane_of_a_face_goes_in_and_out_or_neither() {
+    let runs = 40;
+    let [mut count, mut inside] = [0; 2];
+    for seed in 0..runs as u64 {
+        let mut random = Random::new(seed);
+        let mut cuboid = || {
+            let low = snapped(&mut random, true);
+            (low, low + ((random.in_cube() + 1.25) * 4.0).ceil() / 4.0)
+        };
+        let ((low, high), (mut low_taken, mut high_taken)) = (cuboid(), cuboid());
+        let axis = seed as usize % 3;
+        let is_high = random.chance(0.5);
+        // What is taken away is flush with the plane, on either side of it.
+        let plane = if is_high { high[axis] } else { low[axis] };
+        let side = random.sign() / 2.0;
+        low_taken[axis] = plane.min(plane + side);
+        high_taken[axis] = plane.max(plane + side);
+        let (a, b) = (upright(low, high, "m"), upright(low_taken, high_taken, "other"));
+        let far = sphere(DVec3::splat(50.0), 1.0, "m");
+        let alone = opened(&a);
+        let closed = [
+            join("intersection", &[&a, &all()]),
+            join("union", &[&a, &far]),
+            join("difference", &[&a, &far]),
+            join("union", &[&a, &a]),
+        ]
+        .map(|text| opened(&text));
+        let flush = opened(&join("difference", &[&a, &b]));
+        let probes: Vec<Probe> = (0..rays(100_000) / runs)
+            .map(|_| {
+                let [mut origin, mut target] = [random.direction(), random.in_cube() * 1.5];
+                origin[axis] = 0.0;
+                origin *= 6.0 / origin.length();
+                (origin[axis], target[axis]) = (plane, plane);
+                probe(origin, target)
+            })
+            .collect();
+        for (probe, found) in probes.iter().zip(crossings(&alone, &probes)) {
+            let truth = less(chord(probe, axis, low, high), [0.0, 0.0]);
+            let found = stretches(&found);
+            assert!(found.is_empty() || is_close(&found, &truth), "{probe:?}: {found:?}");
+        }
+        for scene in &closed {
+            for (probe, found) in probes.iter().zip(crossings(scene, &probes)) {
+                let truth = less(chord(probe, axis, low, high), [0.0, 0.0]);
+                let found = stretches(&found);
+                assert!(is_close(&found, &truth), "{probe:?}: {found:?}, truly {truth:?}");
+                (count, inside) = (count + 1, inside + found.len() / 2);
+            }
+        }
+        for (probe, found) in probes.iter().zip(crossings(&flush, &probes)) {
+            let taken = chord(probe, axis, low_taken, high_taken);
+            let truth = less(chord(probe, axis, low, high), taken);
+            let found = stretches(&found);
+            assert!(is_close(&found, &truth), "{probe:?}: {found:?}, truly {truth:?}");
+        }
+    }
+    eprintln!("{count} rays in planes of faces: {inside} stretches inside, each with two ends");
+    assert!(inside > count / 10);
+}
+
+fn is_close(found: &[f64], truth: &[f64]) -> bool {
+    found.len() == truth.len() && found.iter().zip(truth).all(|(f, t)| (f - t).abs() < 1e-12)
+}
+
+/// A die: a box in a ball, less a pip for each eye.
+fn die(place: DVec3, turn: &DMat3, corner: f64, pip: f64) -> String {
+    let mut parts = vec![join(
+        "intersection",
+        &[&parallelepiped_around(place, turn), &sphere(place, corner, "m")],
+    )];
+    for (axis, eyes) in [[1, 6], [2, 5], [3, 4]].into_iter().enumerate() {
+        for (eyes, side) in eyes.into_iter().zip([1.0, -1.0]) {
+            for &(u, v) in EYES[eyes - 1] {
+                let mut at = DVec3::ZERO;
+                (at[axis], at[(axis + 1) % 3], at[(axis + 2) % 3]) = (side, u * 0.5, v * 0.5);
+                parts.push(sphere(place + *turn * at, pip, "other"));
+            }
+        }
+    }
+    join("difference", &parts.iter().map(String::as_str).collect::<Vec<_>>())
+}
+
+fn parallelepiped_around(place: DVec3, turn: &DMat3) -> String {
+    let edges = [turn.x_axis, turn.y_axis, turn.z_axis].map(|axis| axis * 2.0);
+    parallelepiped(place - (edges[0] + edges[1] + edges[2]) / 2.0, edges, "m")
+}
+
+/// Where a die's eyes are.
+const EYES: [&[(f64, f64)]; 6] = [
+    &[(0., 0.)],
+    &[(-1., -1.), (1., 1.)],
+    &[(-1., -1.), (0., 0.), (1., 1.)],
+    &[(-1., -1.), (-1., 1.), (1., -1.), (1., 1.)],
+    &[(-1., -1.), (-1., 1.), (0., 0.), (1., -1.), (1., 1.)],
+    &[(-1., -1.), (-1., 0.), (-1., 1.), (1., -1.), (1., 0.), (1., 1.)],
+];
+
+/// Asks the tracer and the oracle about rays, and tells how many answers are the same and how many
+/// too close to call.
+fn compare_with_oracle(scene: &Scene, probes: &[Probe], what: &str) -> [usize; 2] {
+    let block = PreparedScene::open(prepare(scene).unwrap()).unwrap();
+    let oracle = Oracle::new(scene);
+    let found = block.probe(probes, Isa::fastest());
+    let same = probes
+        .par_iter()
+        .zip(found)
+        .filter(|(probe, found)| check_against_oracle((scene, &oracle), probe, *found, what))
+        .count();
+    [same, probes.len() - same]
+}
+
+/// The same for rays that go on from where those hit, anywhere.
+fn compare_leaving(scene: &Scene, probes: &[Probe], random: &mut Random, what: &str) -> [usize; 2] {
+    let block = PreparedScene::open(prepare(scene).unwrap()).unwrap();
+    let hits = block.probe(probes, Isa::fastest());
+    let leaving = probes.iter().zip(hits).filter_map(|(probe, hit)| {
+        let hit = hit?;
+        let origin = probe.origin + hit.t * probe.direction;
+        let leaving = Some((hit.primitive, hit.face));
+        Some(Probe { origin, direction: random.direction(), leaving })
+    });
+    let leaving: Vec<Probe> = leaving.collect();
+    compare_with_oracle(scene, &leaving, what)
+}
+
+fn add(sum: &mut [usize; 2], more: [usize; 2]) {
+    *sum = [sum[0] + more[0], sum[1] + more[1]];
+}
+
+#[test]
+fn a_die_with_round_corners_and_pips_is_met_where_the_oracle_meets_it() {
+    let mut counts = [0; 2];
+    for seed in 0..10 {
+        let mut random = Random::new(seed);
+        let turn = if seed == 0 { DMat3::IDENTITY } else { turn(&mut random) };
+        let place = random.in_cube() * if seed % 2 == 0 { 0.0 } else { 3.0 };
+        // Pips that touch nothing, or one another and the corners.
+        let (corner, pip) = (random.between(1.35, 1.6), random.between(0.1, 0.3));
+        let scene = read(&die(place, &turn, corner, pip));
+        let probes: Vec<Probe> = (0..rays(100_000) / 20)
+            .map(|_| probe(place + random.direction() * 5.0, place + random.in_cube() * 1.1))
+            .collect();
+        add(&mut counts, compare_with_oracle(&scene, &probes, "a die"));
+        add(&mut counts, compare_leaving(&scene, &probes, &mut random, "leaving a die"));
+    }
+    let [same, close] = counts;
+    eprintln!("a die: {same} answers are the oracle's, {close} too close to call");
+    assert!(same > rays(70_000) && close * 1000 < same);
+}
+
+#[test]
+fn a_ray_that_starts_inside_solids_meets_what_the_oracle_meets() {
+    for style in [Style::Plain, Style::Grid, Style::Far] {
+        let mut counts = [0; 2];
+        for seed in 0..20 {
+            let recipe = Recipe { solids: 3, parallelepipeds: 2, ..Recipe::new(style) };
+            let scene = random_scene(seed, &recipe);
+            let mut random = Random::new(seed);
+            let middle = if style == Style::Far { FAR } else { DVec3::ZERO };
+            let probes: Vec<Probe> = (0..rays(100_000) / 60)
+                .map(|k| {
+                    let origin = middle + snapped(&mut random, style == Style::Grid && k % 2 == 0);
+                    Probe { origin, direction: random.direction(), leaving: None }
+                })
+                .collect();
+            let what = format!("{style:?} scene {seed}, from inside");
+            add(&mut counts, compare_with_oracle(&scene, &probes, &what));
+        }
+        let [same, close] = counts;
+        eprintln!("{style:?}: {same} answers are the oracle's, {close} too close to call");
+    }
+}
+
+/// Where scenes of the style [`Style::Far`] are.
+const FAR: DVec3 = DVec3::new(1e6, -2e6, 3e5);

@@ -1,0 +1,133 @@
+//! `--time`: how good a picture can be in a given time.
+
+use std::time::Duration;
+
+use rayon::prelude::*;
+use rtfarm_coordinator::Order;
+use rtfarm_core::{
+    isa::Isa,
+    prepared::{PreparedBytes, PreparedScene},
+    render::{DEFAULT_ERROR, DEFAULT_MOST_SAMPLES, Quality, Sampling, Settings, render_tile},
+    sample::MOST_SAMPLES,
+    tile::{Area, Size},
+};
+use tokio::time::Instant;
+use tokio_util::sync::CancellationToken;
+
+/// Squares of the frame that are rendered to learn what a setting costs, in each direction.
+const SQUARES: u32 = 5;
+
+/// Their side in pixels.
+const SIDE: u32 = 16;
+
+/// The part of the time that a prediction may take up: it is off by some per cent.
+const PART: f64 = 0.9;
+
+/// The settings from coarse to fine: each asks for an error smaller by √2 than the one before.
+/// Below an 8-bit step pixels may have more samples as well.
+pub(crate) fn ladder() -> impl Iterator<Item = Sampling> {
+    (0..=22).map(|rung: u32| {
+        let halves = f64::from(1_u32 << (rung / 2));
+        let half = if rung.is_multiple_of(2) { 1.0 } else { std::f64::consts::SQRT_2 };
+        let most = DEFAULT_MOST_SAMPLES << rung.saturating_sub(8).min(8);
+        Sampling::Adaptive {
+            error: 16.0 * DEFAULT_ERROR / (halves * half),
+            most: most.min(MOST_SAMPLES),
+        }
+    })
+}
+
+/// Chooses the finest setting of the ladder with which `threads` threads render the picture in
+/// `time`, what the choice itself takes included; the coarsest where none does. `None` when `stop`
+/// came first. Never call this on the async runtime.
+pub(crate) fn choose(
+    order: &Order,
+    (threads, isa): (usize, Isa),
+    time: Duration,
+    stop: &CancellationToken,
+) -> anyhow::Result<Option<Sampling>> {
+    let started = Instant::now();
+    let scene = PreparedScene::open(PreparedBytes::copy_from(order.prepared.as_ref()))?;
+    let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build()?;
+    let size = order.settings.size;
+    let squares = squares(size);
+    let pixels: usize = squares.iter().map(|square| square.pixel_count()).sum();
+    let whole = size.pixel_count() as f64 / pixels as f64;
+    let mut chosen = None;
+    for sampling in ladder() {
+        let quality = Quality { sampling, ..order.settings.quality };
+        let settings = Settings { size, quality };
+        let rung_started = Instant::now();
+        let is_whole = pool.install(|| {
+            squares.par_iter().all(|&square| {
+                let on_progress = &mut || {
+                    if stop.is_cancelled() {
+                        std::ops::ControlFlow::Break(())
+                    } else {
+                        std::ops::ControlFlow::Continue(())
+                    }
+                };
+                render_tile(&scene, &settings, square, isa, on_progress).is_some()
+            })
+        });
+        if !is_whole {
+            return Ok(None);
+        }
+        let predicted = rung_started.elapsed().mul_f64(whole);
+        tracing::debug!(?sampling, ?predicted, "pilot");
+        if started.elapsed() + predicted > time.mul_f64(PART) {
+            break;
+        }
+        chosen = Some(sampling);
+    }
+    Ok(chosen.or_else(|| ladder().next()))
+}
+
+/// Squares all over the frame.
+fn squares(size: Size) -> Vec<Area> {
+    let places = |length: u32| -> Vec<(u32, u32)> {
+        let count = SQUARES.min(length.div_ceil(SIDE));
+        (0..count)
+            .map(|k| {
+                let side = SIDE.min(length);
+                let middle = u64::from(length) * u64::from(2 * k + 1) / u64::from(2 * count);
+                ((middle as u32).saturating_sub(side / 2).min(length - side), side)
+            })
+            .collect()
+    };
+    let (columns, rows) = (places(size.width()), places(size.height()));
+    let across =
+        |(y0, height)| columns.iter().map(move |&(x0, width)| Area { x0, y0, width, height });
+    rows.iter().copied().flat_map(across).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_ladder_falls_and_every_rung_can_be_asked_for() {
+        let rungs: Vec<Sampling> = ladder().collect();
+        let errors: Vec<f64> = (rungs.iter())
+            .map(|rung| match *rung {
+                Sampling::Adaptive { error, most } => {
+                    assert!(Sampling::is_error(error) && Sampling::MOST_COUNTS.contains(&most));
+                    error
+                }
+                Sampling::Fixed(_) => panic!("{rung:?}"),
+            })
+            .collect();
+        assert!(errors.is_sorted_by(|a, b| a > b), "{errors:?}");
+        assert!(rungs.contains(&Sampling::Adaptive { error: DEFAULT_ERROR, most: 256 }));
+    }
+
+    #[test]
+    fn squares_lie_in_the_frame() {
+        for (width, height) in [(1, 1), (17, 3), (100, 75), (65_535, 2), (1280, 720)] {
+            for area in squares(Size::new(width, height).unwrap()) {
+                assert!(u64::from(area.x0 + area.width) <= width, "{area:?}");
+                assert!(u64::from(area.y0 + area.height) <= height, "{area:?}");
+            }
+        }
+    }
+}
