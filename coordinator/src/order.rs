@@ -95,15 +95,6 @@ impl Wish {
                 count = grid.count()
             )));
         }
-        let is_lit = scene.ambient.is_some() || !scene.lights.is_empty();
-        if is_lit
-            && !self.quality.flat
-            && scene.materials.iter().any(|m| m.reflect > 0.0 && m.alpha > 0.0)
-        {
-            tracing::warn!(
-                "mirrors do not light other surfaces yet: no secondary light is rendered"
-            );
-        }
         let prepared = prepare(scene).map_err(|error| other(error.to_string()))?;
         let Self { name, quality, format, .. } = self;
         let settings = Settings { size, quality };

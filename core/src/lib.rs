@@ -25,6 +25,8 @@ mod triangles;
 
 // A scene into a prepared scene.
 mod bvh;
+mod emitter_tree;
+mod emitters;
 mod node;
 mod plane;
 pub mod prepare;
@@ -33,6 +35,8 @@ mod pyramid;
 mod weld;
 
 // A prepared scene into tiles.
+mod emitter;
+mod gather;
 pub mod isa;
 pub mod picture;
 mod pixel;

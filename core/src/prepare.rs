@@ -7,13 +7,15 @@ use rayon::prelude::*;
 
 use crate::{
     bvh::{self, Bounds, Leaflet},
+    emitters::{Emitters, smaller_ball, within},
     exact::is_coplanar,
     node::{self, Child, Frame},
     plane,
     prepared::{
-        Camera, CoplanarRecord, Features, LeafRecord, LightRecord, Lighting, MaterialRecord,
-        PlaneIndex, PlaneRecord, PreparedBytes, QuadrangleRecord, Sections, SolidRecord,
-        SphereRecord, TexturedFace, TriangleRecord, assemble, power_of_two_below_inverse,
+        Camera, CoplanarRecord, EmitterNode, EmitterRecord, Features, LeafRecord, LightRecord,
+        Lighting, MaterialRecord, PlaneIndex, PlaneRecord, PreparedBytes, QuadrangleRecord,
+        Sections, SolidRecord, SphereRecord, TexturedFace, TriangleRecord, assemble,
+        power_of_two_below_inverse,
     },
     pyramid::Pyramids,
     ray::{Item, Kind, Surface},
@@ -41,6 +43,17 @@ pub enum PrepareError {
 /// Turns a scene into a prepared scene, on rayon's threads; the same scene gives the same bytes on
 /// any number of them.
 pub fn prepare(scene: &Scene) -> Result<PreparedBytes, PrepareError> {
+    prepare_gathering(scene, Features::AIMED)
+}
+
+/// The same, but light that faces send on is looked for all over the sky alone: the noisier way
+/// that benchmarks compare with.
+#[doc(hidden)]
+pub fn prepare_unaimed(scene: &Scene) -> Result<PreparedBytes, PrepareError> {
+    prepare_gathering(scene, Features::UNAIMED)
+}
+
+fn prepare_gathering(scene: &Scene, gathering: u32) -> Result<PreparedBytes, PrepareError> {
     let viewport = scene.viewport.ok_or(PrepareError::NoViewport)?;
     let ranks = Ranks::new(scene);
     if ranks.count > Child::ITEM_LIMIT as u64 {
@@ -54,7 +67,7 @@ pub fn prepare(scene: &Scene) -> Result<PreparedBytes, PrepareError> {
     let frame = faces.frame();
     let mut leaflets = faces.leaflets(&frame);
     let nodes = bvh::build_bvh(&mut leaflets);
-    let sorted = faces.sort(&leaflets);
+    let mut sorted = faces.sort(&leaflets);
 
     let mut lights = Vec::with_capacity(scene.lights.len());
     let mut touches = Vec::new();
@@ -86,6 +99,13 @@ pub fn prepare(scene: &Scene) -> Result<PreparedBytes, PrepareError> {
         background: scene.background.to_array(),
         ambient: scene.ambient.unwrap_or_default().to_array(),
     };
+    let mut features = features(scene, &images);
+    let (mut emitters, mut emitter_nodes) = (Vec::new(), Vec::new());
+    if features.is_lit == 1 && materials.iter().any(MaterialRecord::emits) {
+        let found = Emitters::new(&materials, &lights, DVec3::from_array(lighting.ambient));
+        (emitters, emitter_nodes) = faces.find_emitters(found, &mut sorted);
+        features.has_emitters = if emitters.is_empty() { 0 } else { gathering };
+    }
     let sections = Sections {
         nodes: &nodes,
         items: &sorted.items,
@@ -102,13 +122,15 @@ pub fn prepare(scene: &Scene) -> Result<PreparedBytes, PrepareError> {
         solid_nodes: sorted.solid_nodes,
         leaves: sorted.leaves,
         first_ranks: &ranks.firsts,
+        emitters: &emitters,
+        emitter_nodes: &emitter_nodes,
         textured_faces: &images.faces,
         textures: &images.pyramids.textures,
         texture_levels: &images.pyramids.levels,
         fine_texels: &images.pyramids.fine,
         coarse_texels: &images.pyramids.coarse,
     };
-    Ok(assemble(camera, lighting, frame, scale, features(scene, &images), &sections))
+    Ok(assemble(camera, lighting, frame, scale, features, &sections))
 }
 
 /// The images that faces show, and the texture coordinates of those faces by ascending rank.
@@ -196,8 +218,8 @@ fn features(scene: &Scene, images: &Images) -> Features {
         has_branches: u32::from(worn().any(|(m, _)| m.reflect > 0.0 || is_clear(m))),
         has_clear_shadows: u32::from(worn().any(|(m, _)| is_clear(m))),
         has_solids: u32::from(!scene.solids.is_empty()),
+        has_emitters: 0,
         has_textures: u32::from(!images.faces.is_empty()),
-        padding: 0,
     }
 }
 
@@ -710,6 +732,50 @@ impl Faces {
             }
         }
         sorted
+    }
+
+    /// All faces that send light on. Those of solids may need vertices that no other face has.
+    fn find_emitters(
+        &self,
+        mut found: Emitters<'_>,
+        sorted: &mut Sorted<'_>,
+    ) -> (Vec<EmitterRecord>, Vec<EmitterNode>) {
+        for face in &sorted.triangles {
+            found.add_polygon((face.material, face.rank), &face.vertices, &sorted.vertices);
+        }
+        for face in &sorted.coplanars {
+            found.add_polygon((face.material, face.rank), &face.vertices, &sorted.vertices);
+        }
+        for face in &sorted.quadrangles {
+            found.add_polygon((face.material, face.rank), &face.vertices, &sorted.vertices);
+        }
+        for sphere in &sorted.spheres {
+            found.add_sphere((sphere.material, sphere.rank), sphere.center, sphere.radius);
+        }
+        // In the order of `boxes`, so not that of the hierarchy.
+        let mut corners =
+            self.corners[3 * self.triangle_count + 4 * self.quadrangle_count..].chunks(4);
+        for (solid, &bounds) in self.solids.iter().zip(&self.solid_bounds) {
+            for (rank, leaf) in (solid.rank..).step_by(6).zip(&self.leaves[solid.leaves()]) {
+                if leaf.is_sphere() {
+                    let (center, radius) =
+                        smaller_ball(DVec3::from_array(leaf.center), leaf.radius, bounds);
+                    found.add_sphere((leaf.material, rank), center.to_array(), radius);
+                    continue;
+                }
+                for (rank, corners) in (rank..).zip(corners.by_ref().take(6)) {
+                    if !found.is_one(leaf.material) {
+                        continue;
+                    }
+                    let first = sorted.vertices.len() as u32;
+                    let corners = within(corners, bounds);
+                    sorted.vertices.extend(corners.iter().map(DVec3::to_array));
+                    let vertices = [first, first + 1, first + 2, first + 3];
+                    found.add_polygon((leaf.material, rank), &vertices, &sorted.vertices);
+                }
+            }
+        }
+        found.finish()
     }
 }
 
