@@ -1,5 +1,5 @@
 //! Writes `gnome.rt` to standard output: a garden gnome and his bottle on a terrace, with a mirror
-//! behind them, a red ball and toadstools. Everything is spheres, boxes, quadrangles and what the
+//! behind them, a red ball, a die and toadstools. Everything is spheres, boxes, quadrangles and what the
 //! arithmetic of solids makes of them.
 //!
 //!     cargo run --example make_gnome > scenes/gnome.rt
@@ -12,12 +12,12 @@ use std::{f64::consts::TAU, io::Write as _};
 type Point = [f64; 3];
 
 /// What stands beside the name. `refract` is n1/n2 from the front side in.
-const MATERIALS: [(&str, &str); 30] = [
+const MATERIALS: [(&str, &str); 32] = [
     ("planks", "texture planks.png"),
     ("plaster", "color 128 164 160"),
     ("board", "color 226 218 200"),
-    ("lawn", "color 104 150 62"),
-    ("leaves", "color 70 122 58"),
+    ("lawn", "color 176 220 104"),
+    ("leaves", "color 140 206 108"),
     ("gold", "color 222 172 74"),
     ("mirror", "color 0 0 0 reflect 0.92"),
     ("boot", "color 94 58 36"),
@@ -32,7 +32,9 @@ const MATERIALS: [(&str, &str); 30] = [
     ("beard", "color 244 241 234"),
     ("hat", "color 214 40 36"),
     ("brim", "color 150 22 26"),
-    ("ball", "color 255 26 18 reflect 0.25"),
+    ("ball", "color 255 26 18 reflect 0.4"),
+    ("ivory", "color 246 240 226"),
+    ("ink", "color 36 38 48"),
     ("cap", "color 222 54 36"),
     ("stem", "color 240 228 204"),
     ("clay", "color 200 110 68"),
@@ -41,7 +43,7 @@ const MATERIALS: [(&str, &str); 30] = [
     ("label", "texture label.png"),
     // The air's side of a wall of glass, the elixir's side of it, and the air's of the elixir.
     ("glass", "color 255 255 255 alpha 0 refract 0.6667"),
-    ("elixir", "color 255 158 22 alpha 0.45 refract 0.8867"),
+    ("elixir", "color 255 176 34 alpha 0.5 refract 0.8867"),
     ("level", "color 255 190 70 alpha 0.35 refract 0.75"),
     ("clear", "alpha 0"),
 ];
@@ -51,15 +53,15 @@ fn main() -> std::io::Result<()> {
         "# A garden gnome and his bottle. Written by make_gnome.rs.\n\
          viewport",
     )];
-    scene.extend(screen([2.1, 2.15, 8.2], 0.42, [3.0, 1.6875], -0.32));
+    scene.extend(screen([2.1, 2.15, 8.4], 0.47, [3.12, 1.755], -0.38));
     scene.push(String::from("\tsize 1280 720\n\tbackground 186 214 240\nendviewport\nmaterials"));
     scene.extend(MATERIALS.map(|(name, fields)| format!("\tentry name {name} {fields} endentry")));
     scene.push(String::from(
         "endmaterials\n\
          lights\n\
-         \tambient 0.26\n\
+         \tambient 0.3\n\
          \treference power 100 distance 9 endreference\n\
-         \tpoint coords 5.2 7.6 7 power 104 color 255 240 214 endpoint\n\
+         \tpoint coords 5.2 7.6 7 power 124 color 255 240 214 endpoint\n\
          \tpoint coords -6 5 6 power 26 color 200 222 255 endpoint\n\
          endlights\n\
          geometry",
@@ -68,7 +70,8 @@ fn main() -> std::io::Result<()> {
     scene.extend(looking_glass([0.05, 2.15, -2.2], 0.98));
     scene.extend(gnome(-0.75));
     scene.extend(bottle([1.1, 0.66, 0.45]));
-    scene.push(sphere([2.35, 0.45, 0.35], 0.45, "ball"));
+    scene.push(sphere([2.4, 0.45, 0.3], 0.45, "ball"));
+    scene.push(die([3.0, 0.2, 0.5], 0.2, 0.28));
     scene.extend(toadstools([-2.15, 0.0, -0.35]));
     scene.push(String::from("endgeometry\n"));
     std::io::stdout().write_all(scene.join("\n").as_bytes())
@@ -193,10 +196,10 @@ fn looking_glass(at: Point, radius: f64) -> Vec<String> {
     let ball = |radius: f64, material: &str| sphere(at, radius, material);
     let outer = ball(radius + 0.13, "gold");
     vec![
-        solid("difference", [
-            solid("intersection", [slab(0.12, "gold"), outer]),
-            ball(radius, "gold"),
-        ]),
+        solid(
+            "difference",
+            [solid("intersection", [slab(0.12, "gold"), outer]), ball(radius, "gold")],
+        ),
         solid("intersection", [slab(0.04, "mirror"), ball(radius, "mirror")]),
     ]
 }
@@ -210,17 +213,15 @@ fn gnome(x: f64) -> Vec<String> {
         parts.extend(boot(x, side));
         for k in 0..6 {
             let t = f64::from(k) / 5.0;
-            let leg = ball(side * (0.25 - 0.03 * t), 0.3 + 0.2 * t, 0.04, 0.17 + 0.03 * t, "trousers");
+            let leg =
+                ball(side * (0.25 - 0.03 * t), 0.3 + 0.2 * t, 0.04, 0.17 + 0.03 * t, "trousers");
             parts.push(leg);
         }
         // The left arm hangs, the right one lies on the bottle's shoulder.
         for k in 0..24 {
             let t = f64::from(k) / 23.0;
-            let (reach, drop) = if side > 0.0 {
-                (0.78 * t, 0.3 * t - 0.33 * t * t)
-            } else {
-                (0.22 * t, 0.58 * t)
-            };
+            let (reach, drop) =
+                if side > 0.0 { (0.78 * t, 0.3 * t - 0.33 * t * t) } else { (0.22 * t, 0.58 * t) };
             let (y, z) = (1.3 - drop, 0.1 + 0.34 * t * t);
             parts.push(ball(side * (0.42 + reach), y, z, 0.175 - 0.045 * t, "coat"));
         }
@@ -299,37 +300,37 @@ fn belt(x: f64) -> [String; 3] {
         cuboid([x - half, 0.84 - y, near], [x + half, 0.84 + y, far], material)
     };
     [
-        solid("intersection", [
-            cuboid([x - 1.0, 0.76, -1.0], [x + 1.0, 0.92, 1.0], "belt"),
-            sphere([x, 0.82, 0.0], 0.55, "belt"),
-        ]),
-        solid("difference", [
-            buckle(0.15, 0.48, 0.6, "button"),
-            buckle(0.1, 0.4, 0.7, "button"),
-        ]),
+        solid(
+            "intersection",
+            [
+                cuboid([x - 1.0, 0.76, -1.0], [x + 1.0, 0.92, 1.0], "belt"),
+                sphere([x, 0.82, 0.0], 0.55, "belt"),
+            ],
+        ),
+        solid("difference", [buckle(0.15, 0.48, 0.6, "button"), buckle(0.1, 0.4, 0.7, "button")]),
         cuboid([x - 0.1, 0.825, 0.5], [x + 0.04, 0.855, 0.595], "button"),
     ]
 }
 
 /// A cone of balls that leans and curls, on a brim: a lens with a hollow upper side.
 fn hat(x: f64) -> Vec<String> {
-    let mut parts = vec![
-        solid("difference", [
-            solid("intersection", [
-                sphere([x, 2.02, -0.02], 0.5, "brim"),
-                cuboid([x - 1.0, 2.0, -1.0], [x + 1.0, 2.14, 1.0], "brim"),
-            ]),
+    let mut parts = vec![solid(
+        "difference",
+        [
+            solid(
+                "intersection",
+                [
+                    sphere([x, 2.02, -0.02], 0.5, "brim"),
+                    cuboid([x - 1.0, 2.0, -1.0], [x + 1.0, 2.14, 1.0], "brim"),
+                ],
+            ),
             sphere([x, 2.62, -0.02], 0.6, "brim"),
-        ]),
-    ];
+        ],
+    )];
     for k in 0..90 {
         let t = f64::from(k) / 89.0;
         let lean = t * t;
-        let at = [
-            x - 0.3 * lean,
-            2.1 + f64::from(k) / 89.0 - 0.08 * lean * t,
-            -0.03 - 0.22 * lean,
-        ];
+        let at = [x - 0.3 * lean, 2.1 + f64::from(k) / 89.0 - 0.08 * lean * t, -0.03 - 0.22 * lean];
         parts.push(sphere(at, 0.39 * (1.0 - t) + 0.045, "hat"));
     }
     parts.push(sphere([x - 0.32, 3.06, -0.26], 0.1, "beard"));
@@ -369,16 +370,48 @@ fn bottle([x, y, z]: Point) -> Vec<String> {
         [x + right * cos + near * sin, y - 0.04 + up * 0.3, z - right * sin + near * cos]
     });
     vec![
-        solid("difference", [
-            solid("union", outside),
-            hollow(LEVEL, "elixir"),
-            hollow(1.0, "glass"),
-            neck(0.5, 1.3, 0.13, "glass"),
-        ]),
+        solid(
+            "difference",
+            [
+                solid("union", outside),
+                hollow(LEVEL, "elixir"),
+                hollow(1.0, "glass"),
+                neck(0.5, 1.3, 0.13, "glass"),
+            ],
+        ),
         solid("intersection", surface),
         neck(0.98, 1.32, 0.128, "cork"),
         quadrangle(label, None, "label"),
     ]
+}
+
+/// A box within a ball, less its pips: two in front, three to the left, one on top.
+fn die([x, y, z]: Point, half: f64, angle: f64) -> String {
+    const PIPS: [Point; 6] = [
+        [-0.5, -0.5, 1.0],
+        [0.5, 0.5, 1.0],
+        [-1.0, -0.5, -0.5],
+        [-1.0, 0.0, 0.0],
+        [-1.0, 0.5, 0.5],
+        [0.0, 1.0, 0.0],
+    ];
+    let (sin, cos) = angle.sin_cos();
+    let pips = PIPS.map(|[right, up, near]| {
+        let at = [
+            x + half * (right * cos + near * sin),
+            y + half * up,
+            z + half * (near * cos - right * sin),
+        ];
+        sphere(at, 0.24 * half, "ink")
+    });
+    let body = solid(
+        "intersection",
+        [
+            block([x, z], [y - half, y + half], [half, half], angle, "ivory"),
+            sphere([x, y, z], 1.42 * half, "ivory"),
+        ],
+    );
+    solid("difference", [body].into_iter().chain(pips))
 }
 
 /// Toadstools in a pot.
@@ -386,26 +419,36 @@ fn toadstools([x, y, z]: Point) -> Vec<String> {
     let layer = |low: f64, high: f64, material: &str| {
         cuboid([x - 2.0, y + low, z - 2.0], [x + 2.0, y + high, z + 2.0], material)
     };
-    let ball = |height: f64, radius: f64, material: &str| sphere([x, y + height, z], radius, material);
+    let ball =
+        |height: f64, radius: f64, material: &str| sphere([x, y + height, z], radius, material);
     let mut parts = vec![
-        solid("difference", [
-            solid("union", [
-                solid("intersection", [ball(0.5, 0.56, "clay"), layer(0.0, 0.62, "clay")]),
-                solid("intersection", [ball(0.66, 0.6, "clay"), layer(0.56, 0.72, "clay")]),
-            ]),
-            ball(0.66, 0.5, "clay"),
-        ]),
+        solid(
+            "difference",
+            [
+                solid(
+                    "union",
+                    [
+                        solid("intersection", [ball(0.5, 0.56, "clay"), layer(0.0, 0.62, "clay")]),
+                        solid("intersection", [ball(0.66, 0.6, "clay"), layer(0.56, 0.72, "clay")]),
+                    ],
+                ),
+                ball(0.66, 0.5, "clay"),
+            ],
+        ),
         solid("intersection", [ball(0.66, 0.52, "soil"), layer(0.3, 0.64, "soil")]),
     ];
     for (dx, dz, height, radius) in [(-0.12, 0.02, 1.2, 0.4), (0.24, 0.16, 0.9, 0.24)] {
         let at = [x + dx, y + height, z + dz];
         let floor = [at[0] - 1.0, at[1] + 0.15 * radius, at[2] - 1.0];
-        parts.push(solid("intersection", [
-            sphere(at, radius, "cap"),
-            cuboid(floor, [at[0] + 1.0, at[1] + 1.0, at[2] + 1.0], "stem"),
-        ]));
-        for k in 0..12 {
-            let t = f64::from(k) / 11.0;
+        parts.push(solid(
+            "intersection",
+            [
+                sphere(at, radius, "cap"),
+                cuboid(floor, [at[0] + 1.0, at[1] + 1.0, at[2] + 1.0], "stem"),
+            ],
+        ));
+        for k in 0..24 {
+            let t = f64::from(k) / 23.0;
             let stem = [at[0], y + 0.62 + t * (height + 0.15 * radius - 0.62), at[2]];
             parts.push(sphere(stem, radius * (0.38 - 0.12 * t), "stem"));
         }

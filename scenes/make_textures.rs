@@ -138,7 +138,8 @@ fn toadstool(x: f64, y: f64) -> Option<[f64; 3]> {
         [0.0, -0.05, 0.03],
         [-0.21, -0.03, 0.025],
     ];
-    let disc = |cx: f64, cy: f64, radius: f64| (x - cx).powi(2) + (y - cy).powi(2) < radius * radius;
+    let disc =
+        |cx: f64, cy: f64, radius: f64| (x - cx).powi(2) + (y - cy).powi(2) < radius * radius;
     if y < 0.0 && disc(0.0, 0.0, 0.26) {
         let is_spot = SPOTS.iter().any(|[cx, cy, radius]| disc(*cx, *cy, *radius));
         return Some(if is_spot { PAPER } else { RED });
