@@ -145,10 +145,22 @@ fn column(at: [f64; 2], heights: [f64; 2], radius: f64, material: &str) -> Strin
         let angle = TAU / 16.0 * f64::from(k);
         block(at, heights, [radius, radius], angle, material)
     });
-    solid("intersection", boxes)
+    intersection(boxes)
 }
 
-/// `intersection`, `union` or `difference`.
+fn union(operands: impl IntoIterator<Item = String>) -> String {
+    solid("union", operands)
+}
+
+fn intersection(operands: impl IntoIterator<Item = String>) -> String {
+    solid("intersection", operands)
+}
+
+/// The first less all others.
+fn difference(operands: impl IntoIterator<Item = String>) -> String {
+    solid("difference", operands)
+}
+
 fn solid(operation: &str, operands: impl IntoIterator<Item = String>) -> String {
     let operands: Vec<String> = operands.into_iter().collect();
     format!("{operation}\n{}\nend{operation}", operands.join("\n"))
@@ -196,11 +208,8 @@ fn looking_glass(at: Point, radius: f64) -> Vec<String> {
     let ball = |radius: f64, material: &str| sphere(at, radius, material);
     let outer = ball(radius + 0.13, "gold");
     vec![
-        solid(
-            "difference",
-            [solid("intersection", [slab(0.12, "gold"), outer]), ball(radius, "gold")],
-        ),
-        solid("intersection", [slab(0.04, "mirror"), ball(radius, "mirror")]),
+        difference([intersection([slab(0.12, "gold"), outer]), ball(radius, "gold")]),
+        intersection([slab(0.04, "mirror"), ball(radius, "mirror")]),
     ]
 }
 
@@ -282,14 +291,14 @@ fn boot(x: f64, side: f64) -> [String; 2] {
             let at = [x + side * (0.25 + 0.07 * t), 0.17 - 0.01 * t, 0.03 + 0.36 * t];
             sphere(at, 0.18 - 0.02 * t * t + more, material)
         });
-        solid("union", balls)
+        union(balls)
     };
     let layer = |low: f64, high: f64, material: &str| {
         cuboid([x - 1.0, low, -1.0], [x + 1.0, high, 1.0], material)
     };
     [
-        solid("intersection", [layer(0.05, 1.0, "boot"), balls(0.0, "boot")]),
-        solid("intersection", [layer(0.0, 0.06, "sole"), balls(0.03, "sole")]),
+        intersection([layer(0.05, 1.0, "boot"), balls(0.0, "boot")]),
+        intersection([layer(0.0, 0.06, "sole"), balls(0.03, "sole")]),
     ]
 }
 
@@ -300,37 +309,27 @@ fn belt(x: f64) -> [String; 3] {
         cuboid([x - half, 0.84 - y, near], [x + half, 0.84 + y, far], material)
     };
     [
-        solid(
-            "intersection",
-            [
-                cuboid([x - 1.0, 0.76, -1.0], [x + 1.0, 0.92, 1.0], "belt"),
-                sphere([x, 0.82, 0.0], 0.55, "belt"),
-            ],
-        ),
-        solid("difference", [buckle(0.15, 0.48, 0.6, "button"), buckle(0.1, 0.4, 0.7, "button")]),
+        intersection([
+            cuboid([x - 1.0, 0.76, -1.0], [x + 1.0, 0.92, 1.0], "belt"),
+            sphere([x, 0.82, 0.0], 0.55, "belt"),
+        ]),
+        difference([buckle(0.15, 0.48, 0.6, "button"), buckle(0.1, 0.4, 0.7, "button")]),
         cuboid([x - 0.1, 0.825, 0.5], [x + 0.04, 0.855, 0.595], "button"),
     ]
 }
 
 /// A cone of balls that leans and curls, on a brim: a lens with a hollow upper side.
 fn hat(x: f64) -> Vec<String> {
-    let mut parts = vec![solid(
-        "difference",
-        [
-            solid(
-                "intersection",
-                [
-                    sphere([x, 2.02, -0.02], 0.5, "brim"),
-                    cuboid([x - 1.0, 2.0, -1.0], [x + 1.0, 2.14, 1.0], "brim"),
-                ],
-            ),
-            sphere([x, 2.62, -0.02], 0.6, "brim"),
-        ],
-    )];
-    for k in 0..90 {
-        let t = f64::from(k) / 89.0;
+    let disc = [
+        sphere([x, 2.02, -0.02], 0.5, "brim"),
+        cuboid([x - 1.0, 2.0, -1.0], [x + 1.0, 2.14, 1.0], "brim"),
+    ];
+    let hollow = sphere([x, 2.62, -0.02], 0.6, "brim");
+    let mut parts = vec![difference([intersection(disc), hollow])];
+    for k in 0..60 {
+        let t = f64::from(k) / 59.0;
         let lean = t * t;
-        let at = [x - 0.3 * lean, 2.1 + f64::from(k) / 89.0 - 0.08 * lean * t, -0.03 - 0.22 * lean];
+        let at = [x - 0.3 * lean, 2.1 + t - 0.08 * lean * t, -0.03 - 0.22 * lean];
         parts.push(sphere(at, 0.39 * (1.0 - t) + 0.045, "hat"));
     }
     parts.push(sphere([x - 0.32, 3.06, -0.26], 0.1, "beard"));
@@ -352,12 +351,12 @@ fn bottle([x, y, z]: Point) -> Vec<String> {
         column([x, z], [y + low, y + high], radius, material)
     };
     let outside = [
-        solid("intersection", [ball(0.74, "glass"), slice(-0.66, 1.0, 0.42, "glass")]),
+        intersection([ball(0.74, "glass"), slice(-0.66, 1.0, 0.42, "glass")]),
         neck(0.6, 1.14, 0.2, "glass"),
         neck(1.06, 1.18, 0.26, "glass"),
     ];
     let hollow = |high: f64, material: &str| {
-        solid("intersection", [ball(0.67, material), slice(-0.57, high, 0.35, material)])
+        intersection([ball(0.67, material), slice(-0.57, high, 0.35, material)])
     };
     let surface = [
         slice(-1.0, LEVEL, 1.0, "level"),
@@ -370,16 +369,13 @@ fn bottle([x, y, z]: Point) -> Vec<String> {
         [x + right * cos + near * sin, y - 0.04 + up * 0.3, z - right * sin + near * cos]
     });
     vec![
-        solid(
-            "difference",
-            [
-                solid("union", outside),
-                hollow(LEVEL, "elixir"),
-                hollow(1.0, "glass"),
-                neck(0.5, 1.3, 0.13, "glass"),
-            ],
-        ),
-        solid("intersection", surface),
+        difference([
+            union(outside),
+            hollow(LEVEL, "elixir"),
+            hollow(1.0, "glass"),
+            neck(0.5, 1.3, 0.13, "glass"),
+        ]),
+        intersection(surface),
         neck(0.98, 1.32, 0.128, "cork"),
         quadrangle(label, None, "label"),
     ]
@@ -404,14 +400,11 @@ fn die([x, y, z]: Point, half: f64, angle: f64) -> String {
         ];
         sphere(at, 0.24 * half, "ink")
     });
-    let body = solid(
-        "intersection",
-        [
-            block([x, z], [y - half, y + half], [half, half], angle, "ivory"),
-            sphere([x, y, z], 1.42 * half, "ivory"),
-        ],
-    );
-    solid("difference", [body].into_iter().chain(pips))
+    let body = intersection([
+        block([x, z], [y - half, y + half], [half, half], angle, "ivory"),
+        sphere([x, y, z], 1.42 * half, "ivory"),
+    ]);
+    difference([body].into_iter().chain(pips))
 }
 
 /// Toadstools in a pot.
@@ -422,31 +415,22 @@ fn toadstools([x, y, z]: Point) -> Vec<String> {
     let ball =
         |height: f64, radius: f64, material: &str| sphere([x, y + height, z], radius, material);
     let mut parts = vec![
-        solid(
-            "difference",
-            [
-                solid(
-                    "union",
-                    [
-                        solid("intersection", [ball(0.5, 0.56, "clay"), layer(0.0, 0.62, "clay")]),
-                        solid("intersection", [ball(0.66, 0.6, "clay"), layer(0.56, 0.72, "clay")]),
-                    ],
-                ),
-                ball(0.66, 0.5, "clay"),
-            ],
-        ),
-        solid("intersection", [ball(0.66, 0.52, "soil"), layer(0.3, 0.64, "soil")]),
+        difference([
+            union([
+                intersection([ball(0.5, 0.56, "clay"), layer(0.0, 0.62, "clay")]),
+                intersection([ball(0.66, 0.6, "clay"), layer(0.56, 0.72, "clay")]),
+            ]),
+            ball(0.66, 0.5, "clay"),
+        ]),
+        intersection([ball(0.66, 0.52, "soil"), layer(0.3, 0.64, "soil")]),
     ];
     for (dx, dz, height, radius) in [(-0.12, 0.02, 1.2, 0.4), (0.24, 0.16, 0.9, 0.24)] {
         let at = [x + dx, y + height, z + dz];
         let floor = [at[0] - 1.0, at[1] + 0.15 * radius, at[2] - 1.0];
-        parts.push(solid(
-            "intersection",
-            [
-                sphere(at, radius, "cap"),
-                cuboid(floor, [at[0] + 1.0, at[1] + 1.0, at[2] + 1.0], "stem"),
-            ],
-        ));
+        parts.push(intersection([
+            sphere(at, radius, "cap"),
+            cuboid(floor, [at[0] + 1.0, at[1] + 1.0, at[2] + 1.0], "stem"),
+        ]));
         for k in 0..24 {
             let t = f64::from(k) / 23.0;
             let stem = [at[0], y + 0.62 + t * (height + 0.15 * radius - 0.62), at[2]];
