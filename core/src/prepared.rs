@@ -581,7 +581,13 @@ fn check(view: &View<'_>) -> Result<(), &'static str> {
     for (index, node) in view.nodes.iter().enumerate() {
         ensure(levels[index] > 0, "a node without a parent")?;
         ensure(node.planes.as_flattened().iter().all(|x| !x.is_nan()), "a box")?;
-        for &child in node.children.iter().filter(|&&child| child != Child::NONE) {
+        for (k, &child) in node.children.iter().enumerate() {
+            if child == Child::NONE {
+                // Its box is what keeps rays from going there, to the root again.
+                let is_empty = |side: usize| node.planes[side][k] == Node::EMPTY.planes[side][k];
+                ensure((0..6).all(is_empty), "a box")?;
+                continue;
+            }
             if child.is_leaf() {
                 ensure(child.items().end <= view.items.len(), "a leaf")?;
                 continue;
