@@ -139,14 +139,14 @@ impl BoxRay {
             ray.near_origin[axis] = if forward { high } else { low };
             ray.far_origin[axis] = if forward { low } else { high };
         }
-        // A ray that is nowhere meets nothing, above all no boxes of unused children: with a NaN
+        // A ray that is nowhere, or goes nowhere, meets nothing, above all no boxes of unused children: with a NaN
         // or an infinity it would.
         let is_somewhere = |axis: usize| {
             ray.inverse[axis].abs() > 0.0
                 && ray.near_origin[axis].is_finite()
                 && ray.far_origin[axis].is_finite()
         };
-        if !(0..3).all(is_somewhere) {
+        if direction == DVec3::ZERO || !(0..3).all(is_somewhere) {
             ray.high = f32::NAN;
         }
         ray
