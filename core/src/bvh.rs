@@ -343,7 +343,10 @@ mod tests {
     #[test]
     fn coincident_faces_are_halved_not_split_for_ever() {
         let nodes = check(&vec![([0.5; 3], [0.5; 3]); 100_000]);
-        eprintln!("case 29: boxes with one middle end in leaves: {} nodes for 100 000", nodes.len());
+        eprintln!(
+            "case 29: boxes with one middle end in leaves: {} nodes for 100 000",
+            nodes.len()
+        );
     }
 
     #[test]
@@ -406,9 +409,8 @@ mod tests {
     fn bins_cut_a_teapot_in_a_stadium_as_well_as_a_full_sweep() {
         // A stadium of 1, and in it a teapot of a millionth.
         let mut boxes = scattered(2000);
-        let teapot = scattered(2000).into_iter().map(|(min, max)| {
-            [min, max].map(|point: [f32; 3]| point.map(|x| 0.3 + x * 1e-6)).into()
-        });
+        let shrunk = |point: [f32; 3]| point.map(|x| x * 1e-6);
+        let teapot = scattered(2000).into_iter().map(|(min, max)| (shrunk(min), shrunk(max)));
         boxes.extend(teapot);
         let leaflets: Vec<Leaflet> = (0..)
             .zip(boxes)

@@ -126,7 +126,11 @@ fn a_light_at_a_point_that_a_ray_hits_gives_it_nothing() {
     // The middle pixel's ray runs along z.
     let scene = scene(&lamp(0.0, 0.0, 0.0), &wall(0.0, 9.0, "white"));
     assert!(picture(&scene, &settings(41, 41, 1)).into_iter().all(|pixel| pixel == BLACK));
-    tell(58, "a light at the point that a ray hits gives it nothing", "1681 pixels, all dark and finite");
+    tell(
+        58,
+        "a light at the point that a ray hits gives it nothing",
+        "1681 pixels, all dark and finite",
+    );
 }
 
 #[test]
@@ -147,7 +151,11 @@ fn a_light_on_a_surface_still_lights_what_faces_it() {
     for (found, truth) in [(edge, at(20, 0)), (corner, at(3, 0))] {
         assert!((found[0] - truth).abs() < 1e-6 * truth, "{found:?}, truly {truth}");
     }
-    tell(27, "a light on a surface lights what faces it, without a shadow of that surface", "right within 1e-6");
+    tell(
+        27,
+        "a light on a surface lights what faces it, without a shadow of that surface",
+        "right within 1e-6",
+    );
 }
 
 #[test]
@@ -165,7 +173,11 @@ fn a_light_inside_an_opaque_sphere_leaves_all_outside_exactly_dark() {
             assert_eq!(pixel, BLACK, "{seed}: pixel {k}");
         }
     }
-    tell(57, "outside an opaque sphere that holds a light all is exactly dark", format!("{} pixels", 30 * side * side));
+    tell(
+        57,
+        "outside an opaque sphere that holds a light all is exactly dark",
+        format!("{} pixels", 30 * side * side),
+    );
 }
 
 #[test]
@@ -245,7 +257,11 @@ fn a_light_inside_a_shell_of_a_solid_lights_all_of_its_inside() {
             }
         }
     }
-    tell(57, "inside a shell that holds a light all is lit", format!("{count} places, in round cavities right within {worst:.1e}"));
+    tell(
+        57,
+        "inside a shell that holds a light all is lit",
+        format!("{count} places, in round cavities right within {worst:.1e}"),
+    );
     assert!(worst < 1e-6);
 }
 
@@ -293,7 +309,11 @@ fn a_sphere_has_no_acne_up_to_its_terminator() {
         }
         assert!(lit > 50, "{what}: {lit} pixels are lit");
     }
-    tell(59, "a sphere has no acne up to its terminator", "5 spheres of 9216 pixels, no wrong pixel");
+    tell(
+        59,
+        "a sphere has no acne up to its terminator",
+        "5 spheres of 9216 pixels, no wrong pixel",
+    );
 }
 
 /// Of faces in one place only the first is seen, without speckles or acne: the picture is that of
@@ -374,7 +394,11 @@ fn the_first_wins_of_a_quadrangle_and_triangles_over_it() {
         let label = [b, a, d].map(|corner| middle + (corner - middle) / 4.0);
         check_first_wins(&what, &quadrangle, &polygon(&label, "white"));
     }
-    tell(66, "of a quadrangle and triangles over it the first is seen", "6 pictures, no wrong pixel");
+    tell(
+        66,
+        "of a quadrangle and triangles over it the first is seen",
+        "6 pictures, no wrong pixel",
+    );
 }
 
 #[test]
@@ -578,7 +602,11 @@ fn a_ray_from_inside_a_sphere_goes_out_once() {
             count += 1;
         }
     }
-    tell(16, "a ray from inside a sphere goes out once", format!("{count} rays, at {:.1} ulp of it or nearer", 16.0 * worst));
+    tell(
+        16,
+        "a ray from inside a sphere goes out once",
+        format!("{count} rays, at {:.1} ulp of it or nearer", 16.0 * worst),
+    );
     assert!(worst < 1.0);
 }
 
@@ -623,7 +651,11 @@ fn a_ray_that_leaves_a_sphere_outwards_never_meets_it_again() {
         count += probes.len();
         grazing += starts.iter().filter(|start| start.1.abs() < 1e-6 * ball.radius).count();
     }
-    tell(17, "a ray that leaves a sphere outwards never meets it", format!("0 of {count} rays, {grazing} of them grazing"));
+    tell(
+        17,
+        "a ray that leaves a sphere outwards never meets it",
+        format!("0 of {count} rays, {grazing} of them grazing"),
+    );
     assert!(count > rays(95_000));
 }
 
@@ -646,7 +678,11 @@ fn a_ray_that_leaves_a_sphere_inwards_always_meets_its_other_side() {
             count += 1;
         }
     }
-    tell(18, "a ray that leaves a sphere inwards meets its other side", format!("0 of {count} lost; they end within {:.1} ulp of it", 16.0 * worst));
+    tell(
+        18,
+        "a ray that leaves a sphere inwards meets its other side",
+        format!("0 of {count} lost; they end within {:.1} ulp of it", 16.0 * worst),
+    );
     assert!(worst < 1.0);
 }
 

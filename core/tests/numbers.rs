@@ -270,7 +270,7 @@ fn slivers_are_met_where_the_oracle_meets_them() {
     }
     tell(
         9,
-        "slivers down to 1:1e-12 are met as the oracle says",
+        "slivers down to an aspect of 1e-12 are met as the oracle says",
         format!(
             "{} of {} rays the same, {} hits",
             total.same,
@@ -298,7 +298,7 @@ fn a_huge_triangle_beside_tiny_ones_is_met_where_the_oracle_meets_it() {
     }
     tell(
         12,
-        "a triangle of 1e5 beside those of 1: no hit that the oracle lacks",
+        "a triangle of 1e5 beside those of 1 has no hit that the oracle lacks",
         format!("0 wrong of {} rays, {} more within rounding of an edge", total.same, total.close),
     );
 }
@@ -800,7 +800,12 @@ fn what_no_picture_can_show_is_refused() {
         (20, "a radius that is NaN", SCREEN, ball("nan")),
         (25, "an infinite radius", SCREEN, ball("inf")),
         (25, "a number beyond all", SCREEN, ball("1e999")),
-        (36, "a quadrangle that crosses itself", SCREEN, quadrangle(["0 0 0", "1 1 0", "1 0 0", "0 1 0"])),
+        (
+            36,
+            "a quadrangle that crosses itself",
+            SCREEN,
+            quadrangle(["0 0 0", "1 1 0", "1 0 0", "0 1 0"]),
+        ),
         (37, "a bent quadrangle", SCREEN, quadrangle(["0 0 0", "1 0 0", "1 1 0.1", "0 1 0"])),
         (42, "a box without a volume", SCREEN, flat.to_owned()),
         (
@@ -832,11 +837,11 @@ fn triangles_without_area_are_dropped_and_counted() {
     };
     let alone = picture(&scene(&whole), &settings(64, 64, 4));
     for (case, what, nothing) in
-        [(10, "a triangle of no area", &line), (11, "three equal corners", &point)]
+        [(10, "a triangle of no area", &line), (11, "a triangle of three equal corners", &point)]
     {
         let scene = scene(&format!("{nothing}{whole}{nothing}"));
         assert_eq!((scene.dropped.zero_area, scene.triangles.len()), (2, 1), "{what}");
         assert!(picture(&scene, &settings(64, 64, 4)) == alone, "{what}");
-        tell(case, &format!("{what}: dropped and counted"), "the picture is the same to the bit");
+        tell(case, &format!("{what} is dropped and counted"), "the picture is the same to the bit");
     }
 }

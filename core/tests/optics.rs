@@ -9,7 +9,7 @@ mod studio;
 use std::{fmt::Write, ops::ControlFlow, sync::Arc};
 
 use glam::DVec3;
-use long::{random, rays, tell};
+use long::{few_rays, random, rays, tell};
 use parts::{join, sphere, upright};
 use rtfarm_core::{
     isa::Isa,
@@ -17,8 +17,7 @@ use rtfarm_core::{
     scene::{Mesh, MeshShape, MeshVertices, Place, Scene},
 };
 use rtfarm_oracle::{
-    Settings as OracleSettings, closed_forms::irradiance, eye_direction, random::Random,
-    reference_picture,
+    Settings as OracleSettings, closed_forms::irradiance, eye_direction, reference_picture,
 };
 use studio::{picture, pixels, prepared, read, settings, whole};
 
@@ -355,7 +354,11 @@ fn slabs_nested_and_overlapping_bend_at_each_face_by_its_own_ratio_and_side() {
         assert!(asked > rays(4_000), "{what}: {asked} rays arrive");
         (count, worst) = (count + asked, worst.max(error));
     }
-    tell(50, "nested and overlapping slabs bend at each face", format!("{count} rays, right within {worst:.1e} of the light"));
+    tell(
+        50,
+        "nested and overlapping slabs bend at each face",
+        format!("{count} rays, right within {worst:.1e} of the light"),
+    );
 }
 
 #[test]
@@ -795,7 +798,7 @@ fn an_eye_inside_glass_or_a_solid_sees_what_the_oracle_sees() {
         ("a shell's wall", join("difference", &[&cube(1.2, "glass"), &ball(DVec3::X, 0.9)])),
     ] {
         let scene = scene(materials, lights, &(around.clone() + &geometry));
-        let side = side_of(400);
+        let side = few_rays(400).isqrt() as u64;
         let differing = difference_from_oracle(&scene, side);
         assert!(differing * 500 <= (side * side) as usize, "{what}: {differing} pixels differ");
         count += side * side;

@@ -10,7 +10,7 @@ use std::{f64::consts::PI, thread};
 
 use glam::{DMat3, DVec3};
 use judge::check_against_oracle;
-use long::{random, rays, tell};
+use long::{few_rays, random, rays, tell};
 use parts::{join, parallelepiped, sphere, upright};
 use rayon::prelude::*;
 use rtfarm_core::{
@@ -150,7 +150,7 @@ fn random_tree(random: &mut Random, is_snapped: bool, depth: u32) -> String {
 /// Two ways to write one set are crossed alike by random rays.
 fn check_equal_sets(what: &str, write: impl Fn([&str; 3]) -> [String; 2]) {
     let trees = 50;
-    let each = rays(100_000) / trees;
+    let each = few_rays(100_000) / trees;
     let mut crossed = 0;
     for seed in 0..trees as u64 {
         let mut random = random(seed);
@@ -172,7 +172,7 @@ fn check_equal_sets(what: &str, write: impl Fn([&str; 3]) -> [String; 2]) {
             }
         }
     }
-    assert!(crossed > rays(5_000), "{what}: {crossed} crossings in all");
+    assert!(crossed > few_rays(5_000), "{what}: {crossed} crossings in all");
 }
 
 /// A box around everything: what is not in a set is in this less the set.
@@ -349,7 +349,11 @@ fn solids_that_touch_have_no_face_between_them() {
             }
         }
     }
-    tell(46, "solids that touch have no face between them", format!("0 inner hits of {} rays", rays(100_000)));
+    tell(
+        46,
+        "solids that touch have no face between them",
+        format!("0 inner hits of {} rays", rays(100_000)),
+    );
 }
 
 #[test]
@@ -378,7 +382,11 @@ fn a_hole_whose_ends_are_flush_has_no_skin() {
             }
         }
     }
-    tell(44, "a hole whose ends are flush has no skin", format!("0 speckles of {} rays", 2 * rays(100_000)));
+    tell(
+        44,
+        "a hole whose ends are flush has no skin",
+        format!("0 speckles of {} rays", 2 * rays(100_000)),
+    );
 }
 
 #[test]
@@ -415,7 +423,11 @@ fn both_walls_of_a_shell_one_billionth_thick_are_met() {
             }
         }
     }
-    tell(47, "both walls of a shell of 1e-9 are met", format!("its thickness is right within {worst:.1e}"));
+    tell(
+        47,
+        "both walls of a shell of 1e-9 are met",
+        format!("its thickness is right within {worst:.1e}"),
+    );
     assert!(worst < 1e-14);
 }
 
@@ -505,7 +517,7 @@ fn caps_lenses_and_bored_boxes_have_the_volumes_of_the_formulas() {
         ("cube less an eighth", join("difference", &[&cube, &corner]), 8.0 - PI / 48.0),
     ] {
         for along in [DVec3::Z, DVec3::new(0.36, 0.48, 0.8)] {
-            let count = rays(100_000);
+            let count = few_rays(100_000);
             let error = (measured_volume(&solid, along, count) / truth - 1.0).abs();
             eprintln!("{what}: {error:.1e} off with {count} rays");
             assert!(error < 100.0 / count as f64, "{what} along {along}: {error:e}");
@@ -556,7 +568,7 @@ fn a_sheared_box_is_met_where_the_oracle_meets_it_within_its_condition() {
         let text = if run.is_multiple_of(2) { box_text } else { alone(&box_text) };
         let scene = read(&text);
         let (block, oracle) = (opened(&text), Oracle::new(&scene));
-        let probes: Vec<Probe> = (0..rays(100_000) / runs)
+        let probes: Vec<Probe> = (0..few_rays(100_000) / runs)
             .map(|_| {
                 let inside: DVec3 = edges.into_iter().map(|edge| edge * random.unit()).sum();
                 probe(random.direction() * 5.0, corner + inside)
@@ -591,7 +603,7 @@ fn a_sheared_box_is_met_where_the_oracle_meets_it_within_its_condition() {
         "sheared boxes of a condition up to 1e8 are met at the oracle's t",
         format!(
             "{} rays, within {worst:.2} ulp a condition, {across:.1} ulp across the face",
-            rays(100_000)
+            few_rays(100_000)
         ),
     );
     assert!(worst < 8.0 && across < 8.0);
@@ -677,7 +689,11 @@ fn a_ray_in_the_plane_of_a_face_goes_in_and_out_or_neither() {
             assert!(is_close(&found, &truth), "{probe:?}: {found:?}, truly {truth:?}");
         }
     }
-    tell(43, "a ray in the plane of a face goes in and out or neither", format!("{count} rays, {inside} stretches inside"));
+    tell(
+        43,
+        "a ray in the plane of a face goes in and out or neither",
+        format!("{count} rays, {inside} stretches inside"),
+    );
     assert!(inside > count / 10);
 }
 
@@ -760,7 +776,7 @@ fn a_die_with_round_corners_and_pips_is_met_where_the_oracle_meets_it() {
         // Pips that touch nothing, or one another and the corners.
         let (corner, pip) = (random.between(1.35, 1.6), random.between(0.1, 0.3));
         let scene = read(&die(place, &turn, corner, pip));
-        let probes: Vec<Probe> = (0..rays(100_000) / 20)
+        let probes: Vec<Probe> = (0..few_rays(100_000) / 20)
             .map(|_| probe(place + random.direction() * 5.0, place + random.in_cube() * 1.1))
             .collect();
         add(&mut counts, compare_with_oracle(&scene, &probes, "a die"));
@@ -768,7 +784,7 @@ fn a_die_with_round_corners_and_pips_is_met_where_the_oracle_meets_it() {
     }
     let [same, close] = counts;
     eprintln!("a die: {same} answers are the oracle's, {close} too close to call");
-    assert!(same > rays(70_000) && close * 1000 < same);
+    assert!(same > few_rays(70_000) && close * 1000 < same);
 }
 
 #[test]
@@ -780,7 +796,7 @@ fn a_ray_that_starts_inside_solids_meets_what_the_oracle_meets() {
             let scene = random_scene(seed, &recipe);
             let mut random = random(seed);
             let middle = if style == Style::Far { FAR } else { DVec3::ZERO };
-            let probes: Vec<Probe> = (0..rays(100_000) / 60)
+            let probes: Vec<Probe> = (0..few_rays(100_000) / 60)
                 .map(|k| {
                     let origin = middle + snapped(&mut random, style == Style::Grid && k % 2 == 0);
                     Probe { origin, direction: random.direction(), leaving: None }

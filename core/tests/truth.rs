@@ -2,7 +2,6 @@
 
 mod judge;
 
-use glam::DVec3;
 use judge::check_against_oracle;
 use rtfarm_core::{
     isa::Isa,
