@@ -34,6 +34,8 @@ pub(crate) enum Command {
     Submit(SubmitArgs),
     /// Say what is wrong with a scene, and what it needs.
     Check(CheckArgs),
+    /// Measure speed against error.
+    Report(ReportArgs),
 }
 
 /// Which scene, and how it is read.
@@ -67,6 +69,34 @@ pub(crate) struct CheckArgs {
     /// Answer in JSON.
     #[arg(long)]
     pub(crate) json: bool,
+}
+
+#[derive(Debug, ClapArgs)]
+pub(crate) struct ReportArgs {
+    /// The scene to measure, against its own picture at many samples; pictures with closed forms
+    /// by default.
+    #[arg(value_name = "SCENE")]
+    pub(crate) scene: Option<PathBuf>,
+
+    /// The folder that report.md and its plot go into; without it the report goes to standard
+    /// output.
+    #[arg(long, value_name = "DIR")]
+    pub(crate) out: Option<PathBuf>,
+
+    /// How much work goes into it.
+    #[arg(long, value_name = "EFFORT", default_value = "quick")]
+    pub(crate) effort: Effort,
+}
+
+/// How much work goes into a report.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub(crate) enum Effort {
+    /// Some seconds: whether it works.
+    Smoke,
+    /// Some minutes.
+    Quick,
+    /// Figures worth publishing.
+    Full,
 }
 
 /// What picture is wanted.
@@ -261,6 +291,13 @@ impl FromStr for IsaChoice {
     }
 }
 
+impl ReportArgs {
+    /// The user's own scene.
+    pub(crate) fn scene(&self) -> Option<SceneArgs> {
+        self.scene.clone().map(|path| SceneArgs { path, strict: false })
+    }
+}
+
 impl PictureArgs {
     /// Where the picture goes and how it is written.
     pub(crate) fn output(&self) -> anyhow::Result<Output> {
@@ -314,7 +351,7 @@ impl Command {
             Self::Coordinator(args) => args.log_format,
             Self::Worker(args) => args.log_format,
             Self::Submit(args) => args.log_format,
-            Self::Check(_) => LogFormat::Text,
+            Self::Check(_) | Self::Report(_) => LogFormat::Text,
         }
     }
 }

@@ -10,6 +10,7 @@ mod local;
 mod output;
 mod pilot;
 mod render;
+mod report;
 mod source;
 mod submit;
 mod worker;
@@ -58,6 +59,7 @@ async fn run(command: Command, console: &Console) -> Result<(), Failure> {
         Command::Coordinator(args) => coordinator::run(args, &stop).await,
         Command::Worker(args) => worker::run(args, &stop).await,
         Command::Submit(args) => submit::run(args, console, &stop).await,
+        Command::Report(args) => report::run(args, console, &stop).await,
         Command::Check(args) => check::run(args, console, &stop).await,
     }
 }

@@ -4,7 +4,7 @@ use rtfarm_core::{
     picture::PictureFormat,
     prepare::{PrepareError, prepare},
     prepared::PreparedBytes,
-    read::{Diagnostic, Omitted, Reading, Resolve, Severity, read_scene},
+    read::{Diagnostic, Omitted, Reading, Resolve, read_scene},
     render::{Quality, Settings},
     scene::Scene,
     tile::{Size, TileGrid},
@@ -70,20 +70,15 @@ impl Wish {
     pub fn place(self, text: &[u8], resolve: &Resolve<'_>) -> Placed {
         let reading = read_scene(text, resolve);
         let reading = if self.strict { reading.into_strict() } else { reading };
-        let Reading { scene, mut diagnostics, omitted } = reading;
+        let Reading { scene, diagnostics, omitted } = reading;
         let order = match &scene {
-            Some(scene) => self.prepare(scene, text, &mut diagnostics),
+            Some(scene) => self.prepare(scene),
             None => Err(Refusal::Scene),
         };
         Placed { order, diagnostics, omitted }
     }
 
-    fn prepare(
-        self,
-        scene: &Scene,
-        text: &[u8],
-        diagnostics: &mut Vec<Diagnostic>,
-    ) -> Result<Order, Refusal> {
+    fn prepare(self, scene: &Scene) -> Result<Order, Refusal> {
         let other = |reason: String| Refusal::Other(reason);
         let viewport = scene.viewport.ok_or(PrepareError::NoViewport);
         let viewport = viewport.map_err(|error| other(error.to_string()))?;
@@ -100,23 +95,7 @@ impl Wish {
                 count = grid.count()
             )));
         }
-        let is_lit = scene.ambient.is_some() || !scene.lights.is_empty();
-        if is_lit
-            && !self.quality.flat
-            && scene.materials.iter().any(|m| m.reflect > 0.0 && m.alpha > 0.0)
-        {
-            tracing::warn!(
-                "mirrors do not light other surfaces yet: no secondary light is rendered"
-            );
-        }
-        let prepared = prepare(scene).map_err(|error| match error.place() {
-            Some(at) => {
-                let message = error.to_string();
-                diagnostics.push(Diagnostic::at_place(Severity::Error, text, at, message));
-                Refusal::Scene
-            }
-            None => other(error.to_string()),
-        })?;
+        let prepared = prepare(scene).map_err(|error| other(error.to_string()))?;
         let Self { name, quality, format, .. } = self;
         let settings = Settings { size, quality };
         Ok(Order { name, prepared, settings, grid, format })

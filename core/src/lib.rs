@@ -25,13 +25,18 @@ mod triangles;
 
 // A scene into a prepared scene.
 mod bvh;
+mod emitter_tree;
+mod emitters;
 mod node;
 mod plane;
 pub mod prepare;
 pub mod prepared;
+mod pyramid;
 mod weld;
 
 // A prepared scene into tiles.
+mod emitter;
+mod gather;
 pub mod isa;
 pub mod picture;
 mod pixel;
@@ -41,6 +46,9 @@ pub mod render;
 pub mod sample;
 mod solid;
 mod sphere;
+mod spread;
+mod texcoord;
+mod texture_sampling;
 pub mod tile;
 pub mod trace;
 mod triangle;

@@ -2,24 +2,26 @@
 
 use std::collections::HashMap;
 
-use glam::DVec3;
+use glam::{DVec2, DVec3};
 use rayon::prelude::*;
 
 use crate::{
     bvh::{self, Bounds, Leaflet},
+    emitters::{Emitters, smaller_ball, within},
     exact::is_coplanar,
     node::{self, Child, Frame},
     plane,
     prepared::{
-        Camera, CoplanarRecord, Features, LeafRecord, LightRecord, Lighting, MaterialRecord,
-        PlaneIndex, PlaneRecord, PreparedBytes, QuadrangleRecord, Sections, SolidRecord,
-        SphereRecord, TriangleRecord, assemble, power_of_two_below_inverse,
+        Camera, CoplanarRecord, EmitterNode, EmitterRecord, Features, LeafRecord, LightRecord,
+        Lighting, MaterialRecord, PlaneIndex, PlaneRecord, PreparedBytes, QuadrangleRecord,
+        Sections, SolidRecord, SphereRecord, TexturedFace, TriangleRecord, assemble,
+        power_of_two_below_inverse,
     },
+    pyramid::Pyramids,
     ray::{Item, Kind, Surface},
-    scene::{
-        self, Material, Mesh, MeshVertices, Operation, Parallelepiped, Place, Scene, SolidNode,
-    },
+    scene::{self, Material, Mesh, MeshVertices, Operation, Parallelepiped, Scene, SolidNode},
     solid::{self, NodeRecord},
+    texcoord::Texcoords,
     triangle::triangle_normal,
     weld::weld,
 };
@@ -30,14 +32,6 @@ pub enum PrepareError {
     /// There is nothing to look through.
     #[error("a picture needs a `viewport` block with origin, topleft, bottomleft and topright")]
     NoViewport,
-    /// Something that the language has and the tracer does not.
-    #[error("{feature} cannot be rendered yet")]
-    Unsupported {
-        /// What, as its author would say it.
-        feature: String,
-        /// Where the file asks for it.
-        at: Place,
-    },
     /// More faces than indices reach.
     #[error("the scene has {0} faces; at most {limit} can be rendered", limit = Child::ITEM_LIMIT)]
     TooManyFaces(u64),
@@ -46,21 +40,21 @@ pub enum PrepareError {
     Light(usize),
 }
 
-impl PrepareError {
-    /// The place in the scene's text that it is about, if it is about one.
-    pub fn place(&self) -> Option<Place> {
-        match self {
-            Self::Unsupported { at, .. } => Some(*at),
-            _ => None,
-        }
-    }
-}
-
 /// Turns a scene into a prepared scene, on rayon's threads; the same scene gives the same bytes on
 /// any number of them.
 pub fn prepare(scene: &Scene) -> Result<PreparedBytes, PrepareError> {
+    prepare_gathering(scene, Features::AIMED)
+}
+
+/// The same, but light that faces send on is looked for all over the sky alone: the noisier way
+/// that benchmarks compare with.
+#[doc(hidden)]
+pub fn prepare_unaimed(scene: &Scene) -> Result<PreparedBytes, PrepareError> {
+    prepare_gathering(scene, Features::UNAIMED)
+}
+
+fn prepare_gathering(scene: &Scene, gathering: u32) -> Result<PreparedBytes, PrepareError> {
     let viewport = scene.viewport.ok_or(PrepareError::NoViewport)?;
-    refuse_unsupported(scene)?;
     let ranks = Ranks::new(scene);
     if ranks.count > Child::ITEM_LIMIT as u64 {
         return Err(PrepareError::TooManyFaces(ranks.count));
@@ -73,7 +67,7 @@ pub fn prepare(scene: &Scene) -> Result<PreparedBytes, PrepareError> {
     let frame = faces.frame();
     let mut leaflets = faces.leaflets(&frame);
     let nodes = bvh::build_bvh(&mut leaflets);
-    let sorted = faces.sort(&leaflets);
+    let mut sorted = faces.sort(&leaflets);
 
     let mut lights = Vec::with_capacity(scene.lights.len());
     let mut touches = Vec::new();
@@ -88,7 +82,10 @@ pub fn prepare(scene: &Scene) -> Result<PreparedBytes, PrepareError> {
         lights.push(LightRecord::new(position, intensity, first, count));
         touches.extend(surfaces);
     }
-    let materials: Vec<MaterialRecord> = scene.materials.iter().map(MaterialRecord::new).collect();
+    let images = Images::gather(scene, &ranks);
+    let materials: Vec<MaterialRecord> = (scene.materials.iter().zip(&images.of_materials))
+        .map(|(material, &texture)| MaterialRecord::new(material, texture))
+        .collect();
     let [eye, top_left, bottom_left, top_right] =
         [viewport.eye, viewport.top_left, viewport.bottom_left, viewport.top_right]
             .map(|point| point * scale);
@@ -102,6 +99,13 @@ pub fn prepare(scene: &Scene) -> Result<PreparedBytes, PrepareError> {
         background: scene.background.to_array(),
         ambient: scene.ambient.unwrap_or_default().to_array(),
     };
+    let mut features = features(scene, &images);
+    let (mut emitters, mut emitter_nodes) = (Vec::new(), Vec::new());
+    if features.is_lit == 1 && materials.iter().any(MaterialRecord::emits) {
+        let found = Emitters::new(&materials, &lights, DVec3::from_array(lighting.ambient));
+        (emitters, emitter_nodes) = faces.find_emitters(found, &mut sorted);
+        features.has_emitters = if emitters.is_empty() { 0 } else { gathering };
+    }
     let sections = Sections {
         nodes: &nodes,
         items: &sorted.items,
@@ -118,26 +122,67 @@ pub fn prepare(scene: &Scene) -> Result<PreparedBytes, PrepareError> {
         solid_nodes: sorted.solid_nodes,
         leaves: sorted.leaves,
         first_ranks: &ranks.firsts,
+        emitters: &emitters,
+        emitter_nodes: &emitter_nodes,
+        textured_faces: &images.faces,
+        textures: &images.pyramids.textures,
+        texture_levels: &images.pyramids.levels,
+        fine_texels: &images.pyramids.fine,
+        coarse_texels: &images.pyramids.coarse,
     };
-    Ok(assemble(camera, lighting, frame, scale, features(scene), &sections))
+    Ok(assemble(camera, lighting, frame, scale, features, &sections))
 }
 
-/// What the tracer cannot do yet is refused, never ignored; what no face wears is not.
-fn refuse_unsupported(scene: &Scene) -> Result<(), PrepareError> {
-    let is_worn = worn_by(
-        scene.materials.len(),
-        (scene.triangles.iter().map(|face| face.material))
-            .chain(scene.quadrangles.iter().map(|face| face.material)),
-    );
-    for (Material { name, texture, places, .. }, is_worn) in scene.materials.iter().zip(is_worn) {
-        if let (Some(_), Some(at), true) = (texture, places.texture, is_worn) {
-            return Err(PrepareError::Unsupported {
-                feature: format!("the texture of `{name}`"),
-                at,
-            });
+/// The images that faces show, and the texture coordinates of those faces by ascending rank.
+struct Images {
+    pyramids: Pyramids,
+    /// Of each material, the image in `pyramids` or [`MaterialRecord::PLAIN`].
+    of_materials: Vec<u32>,
+    faces: Vec<TexturedFace>,
+}
+
+impl Images {
+    fn gather(scene: &Scene, ranks: &Ranks) -> Self {
+        let is_textured = |material: u32| scene.materials[material as usize].texture.is_some();
+        let triangle_texcoords: HashMap<u32, [DVec2; 3]> =
+            scene.triangle_texcoords.iter().copied().collect();
+        let triangles = (0..).zip(&scene.triangles).map(|(index, face)| {
+            let texcoords = triangle_texcoords
+                .get(&index)
+                .map_or(Texcoords::DEFAULT, |&given| Texcoords::of_triangle(given));
+            (face.material, face.primitive, texcoords)
+        });
+        let quadrangle_texcoords: HashMap<u32, [DVec2; 4]> =
+            scene.quadrangle_texcoords.iter().copied().collect();
+        let quadrangles = (0..).zip(&scene.quadrangles).map(|(index, face)| {
+            let texcoords = quadrangle_texcoords
+                .get(&index)
+                .map_or(Texcoords::DEFAULT, |&given| Texcoords::of_quadrangle(given));
+            (face.material, face.primitive, texcoords)
+        });
+        let mut is_worn = vec![false; scene.materials.len()];
+        let mut faces = Vec::new();
+        for (material, primitive, texcoords) in triangles.chain(quadrangles) {
+            if is_textured(material) {
+                is_worn[material as usize] = true;
+                faces.push(TexturedFace::new(ranks.first(primitive), texcoords));
+            }
         }
+        faces.par_sort_unstable_by_key(|face| face.rank);
+
+        let mut pyramids = Pyramids::default();
+        let mut numbers = vec![None; scene.textures.len()];
+        let of_materials = (scene.materials.iter().zip(is_worn))
+            .map(|(material, is_worn)| match material.texture {
+                Some(texture) if is_worn => *numbers[texture as usize].get_or_insert_with(|| {
+                    pyramids.add(&scene.textures[texture as usize]);
+                    pyramids.textures.len() as u32 - 1
+                }),
+                _ => MaterialRecord::PLAIN,
+            })
+            .collect();
+        Self { pyramids, of_materials, faces }
     }
-    Ok(())
 }
 
 fn worn_by(count: usize, materials: impl Iterator<Item = u32>) -> Vec<bool> {
@@ -149,7 +194,7 @@ fn worn_by(count: usize, materials: impl Iterator<Item = u32>) -> Vec<bool> {
 }
 
 /// What the scene needs of the tracer.
-fn features(scene: &Scene) -> Features {
+fn features(scene: &Scene, images: &Images) -> Features {
     let leaf_materials = scene.solids.iter().flat_map(|solid| {
         solid.nodes.iter().filter_map(|node| match node {
             SolidNode::Sphere(sphere) => Some(sphere.material),
@@ -173,6 +218,8 @@ fn features(scene: &Scene) -> Features {
         has_branches: u32::from(worn().any(|(m, _)| m.reflect > 0.0 || is_clear(m))),
         has_clear_shadows: u32::from(worn().any(|(m, _)| is_clear(m))),
         has_solids: u32::from(!scene.solids.is_empty()),
+        has_emitters: 0,
+        has_textures: u32::from(!images.faces.is_empty()),
     }
 }
 
@@ -685,6 +732,50 @@ impl Faces {
             }
         }
         sorted
+    }
+
+    /// All faces that send light on. Those of solids may need vertices that no other face has.
+    fn find_emitters(
+        &self,
+        mut found: Emitters<'_>,
+        sorted: &mut Sorted<'_>,
+    ) -> (Vec<EmitterRecord>, Vec<EmitterNode>) {
+        for face in &sorted.triangles {
+            found.add_polygon((face.material, face.rank), &face.vertices, &sorted.vertices);
+        }
+        for face in &sorted.coplanars {
+            found.add_polygon((face.material, face.rank), &face.vertices, &sorted.vertices);
+        }
+        for face in &sorted.quadrangles {
+            found.add_polygon((face.material, face.rank), &face.vertices, &sorted.vertices);
+        }
+        for sphere in &sorted.spheres {
+            found.add_sphere((sphere.material, sphere.rank), sphere.center, sphere.radius);
+        }
+        // In the order of `boxes`, so not that of the hierarchy.
+        let mut corners =
+            self.corners[3 * self.triangle_count + 4 * self.quadrangle_count..].chunks(4);
+        for (solid, &bounds) in self.solids.iter().zip(&self.solid_bounds) {
+            for (rank, leaf) in (solid.rank..).step_by(6).zip(&self.leaves[solid.leaves()]) {
+                if leaf.is_sphere() {
+                    let (center, radius) =
+                        smaller_ball(DVec3::from_array(leaf.center), leaf.radius, bounds);
+                    found.add_sphere((leaf.material, rank), center.to_array(), radius);
+                    continue;
+                }
+                for (rank, corners) in (rank..).zip(corners.by_ref().take(6)) {
+                    if !found.is_one(leaf.material) {
+                        continue;
+                    }
+                    let first = sorted.vertices.len() as u32;
+                    let corners = within(corners, bounds);
+                    sorted.vertices.extend(corners.iter().map(DVec3::to_array));
+                    let vertices = [first, first + 1, first + 2, first + 3];
+                    found.add_polygon((leaf.material, rank), &vertices, &sorted.vertices);
+                }
+            }
+        }
+        found.finish()
     }
 }
 

@@ -11,17 +11,20 @@ use std::ops::Range;
 use glam::DVec3;
 
 use crate::{
-    bvh,
+    bvh, emitter_tree,
     node::{Child, Frame, Node},
+    pyramid::{LevelRecord, TextureRecord},
     ray::{Item, Kind, Surface},
     scene::{Material, Sphere},
     solid::{self, NodeRecord},
+    texcoord::Texcoords,
+    texture_sampling::TextureView,
 };
 
 const MAGIC: [u8; 8] = *b"rtfarm\r\n";
 
 /// Changes with the layout or the meaning of any byte.
-const VERSION: u32 = 2;
+const VERSION: u32 = 4;
 
 /// Reads differently on a machine of the other byte order.
 const BYTE_ORDER: u32 = 0x0102_0304;
@@ -79,6 +82,17 @@ pub(crate) struct Features {
     pub(crate) has_clear_shadows: u32,
     /// There are constructive solids.
     pub(crate) has_solids: u32,
+    /// Faces send light on to others: [`Features::AIMED`] or [`Features::UNAIMED`].
+    pub(crate) has_emitters: u32,
+    /// A face shows an image.
+    pub(crate) has_textures: u32,
+}
+
+impl Features {
+    /// Light is looked for where emitters are, as well as all over the sky.
+    pub(crate) const AIMED: u32 = 1;
+    /// Only all over the sky.
+    pub(crate) const UNAIMED: u32 = 2;
 }
 
 /// Light that comes from everywhere.
@@ -292,12 +306,23 @@ pub(crate) struct MaterialRecord {
     pub(crate) alpha: f64,
     /// n1/n2 from the front; 0 and 1 do not bend.
     pub(crate) refract: f64,
+    /// The image that multiplies `color` on faces with texture coordinates, or [`Self::PLAIN`].
+    pub(crate) texture: u32,
+    padding: u32,
 }
 
 impl MaterialRecord {
-    pub(crate) fn new(material: &Material) -> Self {
+    /// No texture.
+    pub(crate) const PLAIN: u32 = u32::MAX;
+
+    pub(crate) fn new(material: &Material, texture: u32) -> Self {
         let Material { color, reflect, alpha, refract, .. } = *material;
-        Self { color: color.to_array(), reflect, alpha, refract }
+        Self { color: color.to_array(), reflect, alpha, refract, texture, padding: 0 }
+    }
+
+    /// Whether faces send light on to others.
+    pub(crate) fn emits(&self) -> bool {
+        self.reflect * self.alpha * DVec3::from_array(self.color).max_element() > 0.0
     }
 
     /// What a shadow ray keeps when it crosses a face.
@@ -324,6 +349,89 @@ impl LightRecord {
             touches_first: first,
             touches_count: count,
         }
+    }
+}
+
+/// A face that sends light on to others. Records are sorted by rank.
+#[derive(Debug, Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
+#[repr(C)]
+pub(crate) struct EmitterRecord {
+    /// Of a sphere its centre, of a polygon its normal times its area.
+    pub(crate) place: [f64; 3],
+    /// The radius, or the area. Above 0.
+    pub(crate) size: f64,
+    /// About what each side sends on at most, in its brightest channel; of a polygon the side that
+    /// `place` leads to first.
+    pub(crate) radiosity: [f64; 2],
+    /// Of a polygon: the diagonal from the first to the third lies inside; the third of a triangle
+    /// stands there twice.
+    pub(crate) vertices: [u32; 4],
+    pub(crate) rank: u32,
+    pub(crate) shape: u32,
+    /// Its leaf in the tree.
+    pub(crate) node: u32,
+    pub(crate) padding: u32,
+}
+
+impl EmitterRecord {
+    pub(crate) const TRIANGLE: u32 = 0;
+    pub(crate) const QUADRANGLE: u32 = 1;
+    pub(crate) const SPHERE: u32 = 2;
+
+    #[inline(always)]
+    pub(crate) fn is_sphere(&self) -> bool {
+        self.shape == Self::SPHERE
+    }
+
+    #[inline(always)]
+    pub(crate) fn is_triangle(&self) -> bool {
+        self.shape == Self::TRIANGLE
+    }
+}
+
+/// A node of the tree over all emitters.
+#[derive(Debug, Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
+#[repr(C)]
+pub(crate) struct EmitterNode {
+    /// Of a ball around its emitters.
+    pub(crate) center: [f64; 3],
+    pub(crate) radius: f64,
+    /// About the share of that ball's disc that they fill. 0..=1.
+    pub(crate) fill: f64,
+    /// What they send on, by their areas.
+    pub(crate) radiosity: f64,
+    pub(crate) parent: u32,
+    /// The first of two, side by side; not of a leaf.
+    pub(crate) child: u32,
+    /// Of a leaf.
+    pub(crate) emitter: u32,
+    pub(crate) padding: u32,
+}
+
+impl EmitterNode {
+    pub(crate) fn leaf(parent: u32, emitter: u32) -> Self {
+        let child = emitter_tree::NO_NODE;
+        Self { parent, child, emitter, ..bytemuck::Zeroable::zeroed() }
+    }
+
+    #[inline(always)]
+    pub(crate) fn is_leaf(&self) -> bool {
+        self.child == emitter_tree::NO_NODE
+    }
+}
+
+/// The texture coordinates of a face.
+#[derive(Debug, Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
+#[repr(C)]
+pub(crate) struct TexturedFace {
+    pub(crate) texcoords: Texcoords,
+    pub(crate) rank: u32,
+    padding: u32,
+}
+
+impl TexturedFace {
+    pub(crate) fn new(rank: u32, texcoords: Texcoords) -> Self {
+        Self { texcoords, rank, padding: 0 }
     }
 }
 
@@ -370,6 +478,13 @@ sections! {
     solid_nodes: NodeRecord,
     leaves: LeafRecord,
     first_ranks: u32,
+    emitters: EmitterRecord,
+    emitter_nodes: EmitterNode,
+    textured_faces: TexturedFace,
+    textures: TextureRecord,
+    texture_levels: LevelRecord,
+    fine_texels: [u8; 4],
+    coarse_texels: [f32; 3],
 }
 
 /// A block as the tracer reads it.
@@ -404,11 +519,25 @@ impl<'a> View<'a> {
         &self.sections.leaves[solid.leaves()]
     }
 
+    /// The emitter of a rank.
+    pub(crate) fn emitter_of(&self, rank: u32) -> Option<u32> {
+        self.emitters.binary_search_by_key(&rank, |emitter| emitter.rank).ok().map(|k| k as u32)
+    }
+
     /// The primitive and its face that have a rank.
     pub(crate) fn primitive_and_face(&self, rank: u32) -> (u32, u32) {
         match self.first_ranks.partition_point(|&first| first <= rank).checked_sub(1) {
             Some(primitive) => (primitive as u32, rank - self.first_ranks[primitive]),
             None => (rank, 0),
+        }
+    }
+
+    /// An image with its levels.
+    pub(crate) fn texture(&self, index: u32) -> TextureView<'a> {
+        TextureView {
+            levels: &self.texture_levels[self.textures[index as usize].levels()],
+            fine: self.fine_texels,
+            coarse: self.coarse_texels,
         }
     }
 
@@ -649,6 +778,8 @@ fn check(view: &View<'_>) -> Result<(), &'static str> {
         let is_share = |x: f64| (0.0..=1.0).contains(&x);
         let whole = finite(&record.color) && finite(&numbers) && record.refract >= 0.0;
         ensure(whole && is_share(record.reflect) && is_share(record.alpha), "a material")?;
+        let has_texture = (record.texture as usize) < view.textures.len();
+        ensure(has_texture || record.texture == MaterialRecord::PLAIN, "a material")?;
     }
     for leaf in view.leaves {
         let whole = finite(&leaf.center) && finite(&[leaf.radius]) && material(leaf.material);
@@ -669,5 +800,47 @@ fn check(view: &View<'_>) -> Result<(), &'static str> {
         let end = light.touches_first as usize + light.touches_count as usize;
         ensure(end <= view.touches.len(), "a light")?;
     }
-    Ok(())
+    check_textures(view)?;
+    check_emitters(view)
+}
+
+/// What those rely on who look at textures.
+fn check_textures(view: &View<'_>) -> Result<(), &'static str> {
+    let ensure = |holds: bool, what: &'static str| if holds { Ok(()) } else { Err(what) };
+    let finite = |numbers: &[f64]| numbers.iter().all(|x| x.is_finite() && x.abs() < 1e100);
+    let is_sorted = view.textured_faces.is_sorted_by(|a, b| a.rank < b.rank);
+    ensure(is_sorted, "the textured faces' order")?;
+    let texcoords = |face: &TexturedFace| finite(face.texcoords.0.as_flattened());
+    ensure(view.textured_faces.iter().all(texcoords), "a texture coordinate")?;
+    for texture in view.textures {
+        let levels = view.texture_levels.get(texture.levels()).ok_or("a texture")?;
+        let (finest, coarser) = levels.split_first().ok_or("a texture")?;
+        ensure(finest.lies_within(view.fine_texels.len()), "a texture")?;
+        let are_within = coarser.iter().all(|level| level.lies_within(view.coarse_texels.len()));
+        ensure(are_within, "a texture's level")?;
+    }
+    let texels = view.coarse_texels.as_flattened();
+    ensure(texels.iter().all(|channel| (0.0..=1.0).contains(channel)), "a texel")
+}
+
+/// What those rely on who aim at emitters.
+fn check_emitters(view: &View<'_>) -> Result<(), &'static str> {
+    let ensure = |holds: bool, what: &'static str| if holds { Ok(()) } else { Err(what) };
+    let finite = |numbers: &[f64]| numbers.iter().all(|x| x.is_finite() && x.abs() < 1e100);
+    let vertices = |emitter: &EmitterRecord| {
+        emitter.vertices.iter().all(|&k| (k as usize) < view.vertices.len()) || emitter.is_sphere()
+    };
+    for emitter in view.emitters {
+        let is_shape = finite(&emitter.place) && finite(&[emitter.size]) && emitter.size > 0.0;
+        let is_known = emitter.shape <= EmitterRecord::SPHERE && vertices(emitter);
+        let is_light = emitter.radiosity.iter().all(|&x| (0.0..=1e100).contains(&x));
+        ensure(is_shape && is_known && is_light, "an emitter")?;
+    }
+    ensure(view.emitters.is_sorted_by(|a, b| a.rank < b.rank), "the emitters' order")?;
+    for node in view.emitter_nodes {
+        let numbers = [node.radius, node.fill, node.radiosity];
+        let is_ball = finite(&node.center) && numbers.iter().all(|&x| (0.0..=1e100).contains(&x));
+        ensure(is_ball, "a node of emitters")?;
+    }
+    emitter_tree::check_tree(view.emitter_nodes, view.emitters).map_err(|()| "the tree of emitters")
 }

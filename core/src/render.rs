@@ -242,15 +242,17 @@ impl Sampler<'_> {
         let each = u64::from(count - had);
         let wanted = chosen.len() as u64 * each;
         let pixel_of = |index: u64| chosen[(index / each) as usize];
+        let spread = 1.0 / f64::from(count).sqrt();
         for first in (0..wanted).step_by(BATCH) {
             let run = first..wanted.min(first + BATCH as u64);
             let samples = run.clone().map(|index| {
                 let pixel = pixel_of(index);
                 let (x, y) = (area.x0 + pixel % area.width, area.y0 + pixel / area.width);
                 let number = had + (index % each) as u32;
-                CameraSample { x, y, sample: Samples::new(count, seed, x, y).sample(number) }
+                let sample = Samples::new(count, seed, x, y).sample(number);
+                CameraSample { x, y, sample, spread }
             });
-            self.batch.start(&self.view.header.camera, self.settings, samples);
+            self.batch.start(&self.view, self.settings, samples);
             self.tally.samples += run.end - run.start;
             self.tally.rays +=
                 self.batch.run(&self.view, &self.settings.quality, self.isa, self.on_progress)?;

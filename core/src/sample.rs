@@ -56,12 +56,27 @@ impl Sample {
         self.numbers(0, self.key)
     }
 
+    /// Three numbers in `0..1` for what a place on its way gathers. Places are told apart by `node`;
+    /// the first one's numbers, whose node is 0, are spread together with the position.
+    pub(crate) fn gather_numbers(&self, node: u64) -> [f64; 3] {
+        let key = if node == 0 { self.key } else { mix(self.key ^ node) };
+        let [choice, u, v] = self.numbers(2, key);
+        // A choice among many needs more than the 23 bits of a number.
+        let more = mix(key ^ u64::from(self.index)) >> 36;
+        [choice + more as f64 * (1.0 / (1_u64 << 51) as f64), u, v]
+    }
+
     fn numbers<const N: usize>(&self, first_dimension: u32, key: u64) -> [f64; N] {
         let scramble = (key >> 32) as u32;
         std::array::from_fn(|k| {
             f64::from(sobol_burley::sample(self.index, first_dimension + k as u32, scramble))
         })
     }
+}
+
+/// The number of a branch that leaves the place of number `node`.
+pub(crate) fn node_after(node: u64, branch: u64) -> u64 {
+    mix(node ^ branch).max(1)
 }
 
 /// Spreads every bit over all. Source: Steele, Lea & Flood, "Fast Splittable Pseudorandom Number

@@ -9,11 +9,14 @@ use std::ops::ControlFlow;
 use glam::DVec3;
 
 use crate::{
+    gather::Gatherer,
     isa::Isa,
-    prepared::{Camera, PlaneIndex, View},
+    prepared::{MaterialRecord, PlaneIndex, View},
     ray::{Hit, Kind, Ray, Surface},
     render::{Quality, Settings},
-    sample::Sample,
+    sample::{Sample, node_after},
+    spread::Spread,
+    texture_sampling::texture_color,
     trace::{self, trace, trace_shadows},
     triangle::triangle_normal,
 };
@@ -30,14 +33,20 @@ pub(crate) struct CameraSample {
     pub(crate) y: u32,
     /// Its random numbers.
     pub(crate) sample: Sample,
+    /// The width of the square that it stands for, in pixels.
+    pub(crate) spread: f64,
 }
 
 /// Samples on their way, and the queues that they pass through.
 #[derive(Debug, Default)]
 pub(crate) struct Batch {
+    /// The random numbers of each sample.
+    samples: Vec<Sample>,
     /// The rays of the current depth, and what each adds to.
     rays: Vec<Ray>,
     branches: Vec<Branch>,
+    /// What each ray's sample is wide; empty in a scene without textures.
+    spreads: Vec<Spread>,
     hits: Vec<Hit>,
     points: Vec<Point>,
     shadow_rays: Vec<Ray>,
@@ -46,6 +55,8 @@ pub(crate) struct Batch {
     shares: Vec<f64>,
     next_rays: Vec<Ray>,
     next_branches: Vec<Branch>,
+    gatherer: Gatherer,
+    next_spreads: Vec<Spread>,
     /// What each sample sees.
     pub(crate) colors: Vec<DVec3>,
     /// Of each sample, the weights of the branches that were not traced.
@@ -58,39 +69,52 @@ struct Branch {
     sample: usize,
     /// The product of the factors on the way from the sample.
     weight: f64,
+    /// Tells the sample's branches apart; 0 for the camera ray.
+    node: u64,
 }
 
 /// A place on a surface that a ray sees.
 #[derive(Debug)]
-struct Point {
-    sample: usize,
+pub(crate) struct Point {
+    pub(crate) sample: usize,
+    /// The number of the branch that has met it.
+    pub(crate) node: u64,
     /// What the surface's own light counts in the sample.
-    weight: f64,
-    position: DVec3,
+    pub(crate) weight: f64,
+    pub(crate) position: DVec3,
     /// Of length 1, towards the side that is seen.
-    normal: DVec3,
-    surface: Surface,
-    color: DVec3,
+    pub(crate) normal: DVec3,
+    pub(crate) surface: Surface,
+    pub(crate) color: DVec3,
     /// The light received so far.
-    light: DVec3,
+    pub(crate) light: DVec3,
 }
 
 impl Batch {
     /// Queues the camera rays of `samples`.
     pub(crate) fn start(
         &mut self,
-        camera: &Camera,
+        view: &View<'_>,
         settings: &Settings,
         samples: impl Iterator<Item = CameraSample>,
     ) {
-        let size = settings.size;
+        let (size, camera) = (settings.size, &view.header.camera);
+        let has_textures = view.header.features.has_textures == 1;
         let screen = [camera.top_left, camera.right, camera.down].map(DVec3::from_array);
         self.rays.clear();
-        self.rays.extend(samples.map(|CameraSample { x, y, sample }| {
+        self.samples.clear();
+        self.spreads.clear();
+        self.rays.extend(samples.map(|CameraSample { x, y, sample, spread }| {
+            self.samples.push(sample);
             let [across, down] = sample.position();
             let u = (f64::from(x) + across) / f64::from(size.width());
             let v = (f64::from(y) + down) / f64::from(size.height());
             let direction = screen[0] + u * screen[1] + v * screen[2];
+            if has_textures {
+                let steps = [(1, size.width()), (2, size.height())]
+                    .map(|(side, count)| screen[side] * (spread / f64::from(count)));
+                self.spreads.push(Spread::of_camera(direction, steps));
+            }
             Ray {
                 origin: DVec3::from_array(camera.eye),
                 direction: direction / direction.length(),
@@ -100,7 +124,11 @@ impl Batch {
             }
         }));
         self.branches.clear();
-        self.branches.extend((0..self.rays.len()).map(|sample| Branch { sample, weight: 1.0 }));
+        self.branches.extend((0..self.rays.len()).map(|sample| Branch {
+            sample,
+            weight: 1.0,
+            node: 0,
+        }));
         self.colors.clear();
         self.colors.resize(self.rays.len(), DVec3::ZERO);
         self.cut.clear();
@@ -127,20 +155,25 @@ impl Batch {
             self.points.clear();
             self.next_rays.clear();
             self.next_branches.clear();
+            self.next_spreads.clear();
             for index in 0..self.rays.len() {
-                let (ray, hit, branch) = (self.rays[index], self.hits[index], self.branches[index]);
-                if hit.is_some() {
-                    self.meet(view, &ray, &hit, branch, quality.cutoff, depth);
+                let branch = self.branches[index];
+                if self.hits[index].is_some() {
+                    self.meet(view, index, quality.cutoff, depth);
                 } else {
                     self.colors[branch.sample] += branch.weight * background;
                 }
             }
             ray_count += self.light_points(view, quality.flat, isa);
+            if quality.secondary && !quality.flat && view.header.features.has_emitters != 0 {
+                ray_count += self.gather(view, isa);
+            }
             for point in &self.points {
                 self.colors[point.sample] += point.weight * (point.color * point.light);
             }
             std::mem::swap(&mut self.rays, &mut self.next_rays);
             std::mem::swap(&mut self.branches, &mut self.next_branches);
+            std::mem::swap(&mut self.spreads, &mut self.next_spreads);
             depth += 1;
         }
         for (color, cut) in self.colors.iter_mut().zip(&self.cut) {
@@ -149,16 +182,10 @@ impl Batch {
         ControlFlow::Continue(ray_count)
     }
 
-    /// A ray has met a face: queues what its own light and its branches need.
-    fn meet(
-        &mut self,
-        view: &View<'_>,
-        ray: &Ray,
-        hit: &Hit,
-        Branch { sample, weight }: Branch,
-        cutoff: f64,
-        depth: u32,
-    ) {
+    /// Ray `index` has met a face: queues what its own light and its branches need.
+    fn meet(&mut self, view: &View<'_>, index: usize, cutoff: f64, depth: u32) {
+        let (ray, hit) = (&self.rays[index], &self.hits[index]);
+        let Branch { sample, weight, node } = self.branches[index];
         let position = ray.origin + hit.t * ray.direction;
         let outward = face_normal(view, hit, position);
         let is_front = outward.dot(ray.direction) <= 0.0;
@@ -166,38 +193,46 @@ impl Batch {
         let surface = trace::surface(view, hit.item, hit.part);
         let material = &view.materials[trace::material(view, hit.item, hit.part) as usize];
         let (reflect, alpha) = (material.reflect, material.alpha);
+        let spread =
+            self.spreads.get(index).map(|spread| spread.transfer(ray.direction, hit.t, normal));
         if reflect < 1.0 && alpha > 0.0 {
+            let steps = spread.map(|spread| spread.origin);
             self.points.push(Point {
                 sample,
+                node,
                 weight: weight * ((1.0 - reflect) * alpha),
                 position,
                 normal,
                 surface,
-                color: DVec3::from_array(material.color),
+                color: surface_color(view, material, hit, (position, outward), steps),
                 light: DVec3::from_array(view.header.lighting.ambient),
             });
         }
         if view.header.features.has_branches == 0 {
             return;
         }
-        let mut follow = |direction: DVec3, after: u32, weight: f64| {
-            if weight < cutoff || depth == DEEPEST {
-                self.cut[sample] += weight;
-                return;
-            }
-            self.next_rays.push(Ray {
-                origin: position,
-                direction,
-                reach: f64::INFINITY,
-                leaving: surface,
-                after,
-            });
-            self.next_branches.push(Branch { sample, weight });
-        };
+        let mut follow =
+            |direction: DVec3, after: u32, weight: f64, branch: u64, spread: Option<Spread>| {
+                if weight < cutoff || depth == DEEPEST {
+                    self.cut[sample] += weight;
+                    return;
+                }
+                self.next_rays.push(Ray {
+                    origin: position,
+                    direction,
+                    reach: f64::INFINITY,
+                    leaving: surface,
+                    after,
+                });
+                self.next_branches.push(Branch { sample, weight, node: node_after(node, branch) });
+                self.next_spreads.extend(spread);
+            };
         let cosine = -normal.dot(ray.direction);
         let mirrored = mirror(ray.direction, normal, cosine);
+        let curvature = if spread.is_some() { curvature(view, hit, position, normal) } else { 0.0 };
+        let mirrored_spread = spread.map(|spread| spread.mirror(ray.direction, normal, curvature));
         if reflect > 0.0 {
-            follow(mirrored, Ray::NOTHING_AHEAD, weight * reflect);
+            follow(mirrored, Ray::NOTHING_AHEAD, weight * reflect, 1, mirrored_spread);
         }
         if reflect < 1.0 && alpha < 1.0 {
             let weight = weight * ((1.0 - reflect) * (1.0 - alpha));
@@ -209,8 +244,14 @@ impl Batch {
                 refract(ray.direction, normal, cosine, ratio)
             };
             match bent {
-                Some(direction) => follow(direction, hit.rank, weight),
-                None => follow(mirrored, Ray::NOTHING_AHEAD, weight), // Total reflection.
+                Some(direction) => {
+                    let refract =
+                        |spread: Spread| spread.refract(ray.direction, normal, curvature, ratio);
+                    let bent = if is_straight { spread } else { spread.map(refract) };
+                    follow(direction, hit.rank, weight, 2, bent);
+                }
+                // Total reflection.
+                None => follow(mirrored, Ray::NOTHING_AHEAD, weight, 2, mirrored_spread),
             }
         }
     }
@@ -222,6 +263,16 @@ impl Batch {
             return 0;
         }
         (0..view.lights.len()).map(|index| self.light(view, index, isa)).sum()
+    }
+
+    /// Adds the light that other faces send on to the points; how many rays that took.
+    fn gather(&mut self, view: &View<'_>, isa: Isa) -> u64 {
+        let mut ray_count = self.gatherer.find_sources(view, isa, &self.points, &self.samples);
+        std::mem::swap(&mut self.points, &mut self.gatherer.sources);
+        ray_count += self.light_points(view, false, isa);
+        std::mem::swap(&mut self.points, &mut self.gatherer.sources);
+        self.gatherer.deliver(&mut self.points);
+        ray_count
     }
 
     /// Adds what light `index` gives each point; how many rays that took.
@@ -256,6 +307,24 @@ impl Batch {
     }
 }
 
+/// The colour of a face at a hit, its texture included, which is seen through a footprint that is
+/// `steps` wide along the face. They are none in a scene without textures.
+pub(crate) fn surface_color(
+    view: &View<'_>,
+    material: &MaterialRecord,
+    hit: &Hit,
+    at: (DVec3, DVec3),
+    steps: Option<[DVec3; 2]>,
+) -> DVec3 {
+    let color = DVec3::from_array(material.color);
+    match steps {
+        Some(steps) if material.texture != MaterialRecord::PLAIN => {
+            color * texture_color(view, material.texture, hit, at, steps)
+        }
+        _ => color,
+    }
+}
+
 /// The direction of mirrored light; `cosine` is that between the normal and where it came from.
 fn mirror(direction: DVec3, normal: DVec3, cosine: f64) -> DVec3 {
     let mirrored = direction + 2.0 * cosine * normal;
@@ -272,8 +341,27 @@ fn refract(direction: DVec3, normal: DVec3, cosine: f64, ratio: f64) -> Option<D
     })
 }
 
+/// By how much a step along what a ray hit turns its `normal`, per unit of the step: 0 on a flat
+/// face, below 0 on a sphere that is seen from within.
+fn curvature(view: &View<'_>, hit: &Hit, position: DVec3, normal: DVec3) -> f64 {
+    let index = hit.item.index();
+    let center = match hit.item.kind() {
+        Some(Kind::Sphere) => view.spheres[index].center,
+        Some(Kind::Solid) => {
+            let leaf = &view.solid_leaves(&view.solids[index])[hit.part as usize / 6];
+            if !leaf.is_sphere() {
+                return 0.0;
+            }
+            leaf.center
+        }
+        _ => return 0.0,
+    };
+    let from_center = position - DVec3::from_array(center);
+    normal.dot(from_center) / from_center.length_squared()
+}
+
 /// The unit normal towards the front of what a ray hit.
-fn face_normal(view: &View<'_>, hit: &Hit, position: DVec3) -> DVec3 {
+pub(crate) fn face_normal(view: &View<'_>, hit: &Hit, position: DVec3) -> DVec3 {
     let of_plane =
         |plane: PlaneIndex| DVec3::from_array(view.planes[plane.index()].normal) * plane.sign();
     let of_sphere = |center: [f64; 3]| {

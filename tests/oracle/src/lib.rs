@@ -23,6 +23,7 @@ mod solid;
 mod light;
 mod picture;
 mod radiance;
+mod texture;
 
 // What needs no rays.
 pub mod closed_forms;

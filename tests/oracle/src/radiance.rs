@@ -75,7 +75,7 @@ impl Oracle {
             radiance += reflect * follow(mirrored, false, reflect);
         }
         if reflect < 1.0 && alpha > 0.0 {
-            let surface = material.color * self.irradiance(&crossing, &hit, settings);
+            let surface = self.surface_color(&hit) * self.irradiance(&crossing, &hit, settings);
             radiance += (1.0 - reflect) * alpha * surface;
         }
         if reflect < 1.0 && alpha < 1.0 {

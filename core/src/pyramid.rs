@@ -1,0 +1,176 @@
+//! Images at every size down to one texel, for footprints of every size.
+//!
+//! Source: Williams, "Pyramidal Parametrics" (1983).
+
+use std::ops::Range;
+
+use rayon::prelude::*;
+
+use crate::scene::Texture;
+
+/// An image: a run of levels.
+#[derive(Debug, Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
+#[repr(C)]
+pub(crate) struct TextureRecord {
+    pub(crate) first_level: u32,
+    /// At least 1.
+    pub(crate) level_count: u32,
+}
+
+/// An image at one size.
+#[derive(Debug, Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
+#[repr(C)]
+pub(crate) struct LevelRecord {
+    pub(crate) width: u32,
+    pub(crate) height: u32,
+    /// Of its first texel: of an image's first level among the fine ones, else among the coarse
+    /// ones.
+    pub(crate) offset: u64,
+}
+
+impl TextureRecord {
+    pub(crate) fn levels(self) -> Range<usize> {
+        self.first_level as usize..self.first_level as usize + self.level_count as usize
+    }
+}
+
+impl LevelRecord {
+    /// Whether it has texels, and they are among so many.
+    pub(crate) fn lies_within(&self, texel_count: usize) -> bool {
+        let count = u64::from(self.width) * u64::from(self.height);
+        let end = self.offset.checked_add(count);
+        count > 0 && end.is_some_and(|end| end <= texel_count as u64)
+    }
+}
+
+/// Images with all their levels, `[y][x]` each.
+#[derive(Debug, Default)]
+pub(crate) struct Pyramids {
+    pub(crate) textures: Vec<TextureRecord>,
+    pub(crate) levels: Vec<LevelRecord>,
+    /// Of the images themselves: red, green, blue in 255ths, and 0.
+    pub(crate) fine: Vec<[u8; 4]>,
+    /// Of all other levels: red, green, blue.
+    pub(crate) coarse: Vec<[f32; 3]>,
+}
+
+impl Pyramids {
+    /// Adds an image: the same texels on any number of threads.
+    pub(crate) fn add(&mut self, texture: &Texture) {
+        let (mut width, mut height) = (texture.width, texture.height);
+        let first_level = self.levels.len() as u32;
+        self.levels.push(LevelRecord { width, height, offset: self.fine.len() as u64 });
+        self.fine.par_extend(texture.texels.par_iter().map(|&[r, g, b]| [r, g, b, 0]));
+        let mut last_start = None;
+        while width > 1 || height > 1 {
+            let texels = match last_start {
+                None => half_size(width, height, |x, y| {
+                    let texel = texture.texels[y as usize * texture.width as usize + x as usize];
+                    texel.map(|channel| f64::from(channel) / 255.0)
+                }),
+                Some(start) => {
+                    let finer: &[[f32; 3]] = &self.coarse[start..];
+                    let at = |x, y| finer[y as usize * width as usize + x as usize].map(f64::from);
+                    half_size(width, height, at)
+                }
+            };
+            (width, height) = (half(width), half(height));
+            let start = self.coarse.len();
+            self.levels.push(LevelRecord { width, height, offset: start as u64 });
+            self.coarse.extend(texels);
+            last_start = Some(start);
+        }
+        let level_count = self.levels.len() as u32 - first_level;
+        self.textures.push(TextureRecord { first_level, level_count });
+    }
+}
+
+fn half(side: u32) -> u32 {
+    (side / 2).max(1)
+}
+
+/// The next level of an image whose texels `at` gives as (x, y): each texel the mean over its
+/// area, whether or not that cuts finer texels, so that the mean of the whole is kept.
+fn half_size(width: u32, height: u32, at: impl Fn(u32, u32) -> [f64; 3] + Sync) -> Vec<[f32; 3]> {
+    let (columns, rows) = (half(width), half(height));
+    let mut texels = vec![[0.0; 3]; columns as usize * rows as usize];
+    texels.par_chunks_mut(columns as usize).zip(0..rows).for_each(|(row, y)| {
+        for (texel, x) in row.iter_mut().zip(0..columns) {
+            let mut sum = [0.0; 3];
+            for (y, down) in parts(y, height, rows) {
+                for (x, across) in parts(x, width, columns) {
+                    for (sum, channel) in sum.iter_mut().zip(at(x, y)) {
+                        *sum += down * across * channel;
+                    }
+                }
+            }
+            *texel = sum.map(|sum| (sum / (f64::from(width) * f64::from(height))) as f32);
+        }
+    });
+    texels
+}
+
+/// Which of `fine` parts of a line the `index`th of `coarse` parts covers, and how much of each, in
+/// units of 1 / `coarse` part: whole numbers whose sum is `fine`.
+fn parts(index: u32, fine: u32, coarse: u32) -> impl Iterator<Item = (u32, f64)> {
+    let [index, fine, coarse] = [index, fine, coarse].map(u64::from);
+    let (start, end) = (index * fine, (index + 1) * fine);
+    (start / coarse..end.div_ceil(coarse)).map(move |part| {
+        let covered = end.min((part + 1) * coarse) - start.max(part * coarse);
+        (part as u32, covered as f64)
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn texture(width: u32, height: u32) -> Texture {
+        let channel = |k: u32| (k.wrapping_mul(2_654_435_761) >> 24) as u8;
+        let texels = (0..width * height).map(|k| [channel(k), channel(k + 7), 255]).collect();
+        Texture { path: String::new(), width, height, texels }
+    }
+
+    #[test]
+    fn every_level_keeps_the_mean() {
+        let mut worst = 0.0_f64;
+        for (width, height) in [(1, 1), (2, 2), (64, 64), (3, 5), (1, 1000), (1023, 37), (640, 479)]
+        {
+            let texture = texture(width, height);
+            let mut pyramids = Pyramids::default();
+            pyramids.add(&texture);
+            let mean = |texels: &mut dyn Iterator<Item = [f64; 3]>, count: usize| {
+                texels
+                    .fold([0.0; 3], |sum, texel| [0, 1, 2].map(|k| sum[k] + texel[k]))
+                    .map(|sum| sum / count as f64)
+            };
+            let fine = &mut texture.texels.iter().map(|t| t.map(|c| f64::from(c) / 255.0));
+            let truth = mean(fine, texture.texels.len());
+            for level in &pyramids.levels[1..] {
+                let start = level.offset as usize;
+                let texels = &pyramids.coarse[start..][..(level.width * level.height) as usize];
+                let found = mean(&mut texels.iter().map(|t| t.map(f64::from)), texels.len());
+                let off = found.iter().zip(truth).map(|(f, t)| (f - t).abs()).fold(0.0, f64::max);
+                worst = worst.max(off);
+            }
+            let last = pyramids.levels.last().unwrap();
+            assert_eq!((last.width, last.height), (1, 1));
+        }
+        eprintln!("means are kept to {worst:.1e}");
+        assert!(worst < 1e-6);
+    }
+
+    #[test]
+    fn the_number_of_threads_changes_no_texel() {
+        let texels = |threads| {
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+            pool.install(|| {
+                let mut pyramids = Pyramids::default();
+                pyramids.add(&texture(301, 203));
+                pyramids.coarse.iter().map(|texel| texel.map(f32::to_bits)).collect::<Vec<_>>()
+            })
+        };
+        let one = texels(1);
+        assert!(one == texels(2) && one == texels(5));
+    }
+}

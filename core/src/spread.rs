@@ -1,0 +1,135 @@
+//! How far apart neighbouring samples' rays are, on their way through the scene.
+//!
+//! Source: Igehy, "Tracing Ray Differentials" (1999).
+
+use glam::DVec3;
+
+/// The derivatives of a ray by its sample's place, across and down the screen; a step of 1 is what
+/// belongs to one sample.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Spread {
+    /// Of the ray's origin. After [`Spread::transfer`] they lie in the surface.
+    pub(crate) origin: [DVec3; 2],
+    /// Of the ray's direction, which has length 1.
+    direction: [DVec3; 2],
+}
+
+impl Spread {
+    /// Of a camera ray towards `target` (seen from the eye), which a sample's `steps` move.
+    pub(crate) fn of_camera(target: DVec3, steps: [DVec3; 2]) -> Self {
+        let length = target.length();
+        let direction = target / length;
+        let turn = |step: DVec3| (step - direction * direction.dot(step)) / length;
+        Self { origin: [DVec3::ZERO; 2], direction: steps.map(turn) }
+    }
+
+    /// Where the ray has met a surface at the distance `t`. Not finite for a ray along it.
+    pub(crate) fn transfer(&self, direction: DVec3, t: f64, normal: DVec3) -> Self {
+        let origin = [0, 1].map(|k| {
+            let moved = self.origin[k] + t * self.direction[k];
+            moved - (moved.dot(normal) / direction.dot(normal)) * direction
+        });
+        Self { origin, ..*self }
+    }
+
+    /// After a mirror: `direction` came in, towards the side of the unit `normal`; a step along the
+    /// surface turns the normal by `curvature` times the step.
+    pub(crate) fn mirror(&self, direction: DVec3, normal: DVec3, curvature: f64) -> Self {
+        let cosine = -direction.dot(normal);
+        self.turn(direction, normal, curvature, [1.0, 2.0 * cosine, 2.0])
+    }
+
+    /// After a refraction by n1/n2 = `ratio`; see [`Spread::mirror`]. Not finite at the critical
+    /// angle.
+    pub(crate) fn refract(
+        &self,
+        direction: DVec3,
+        normal: DVec3,
+        curvature: f64,
+        ratio: f64,
+    ) -> Self {
+        let cosine = -direction.dot(normal);
+        let behind = (1.0 - ratio * ratio * ((1.0 - cosine) * (1.0 + cosine))).sqrt();
+        let slope = ratio - ratio * ratio * cosine / behind;
+        self.turn(direction, normal, curvature, [ratio, ratio * cosine - behind, slope])
+    }
+
+    /// The new direction is `kept` times the old one and `share` times the normal; `slope` is the
+    /// share's derivative by the cosine between the normal and where the ray came from.
+    fn turn(
+        &self,
+        direction: DVec3,
+        normal: DVec3,
+        curvature: f64,
+        [kept, share, slope]: [f64; 3],
+    ) -> Self {
+        let directions = [0, 1].map(|k| {
+            let normal_step = curvature * self.origin[k];
+            let cosine_step = -(self.direction[k].dot(normal) + direction.dot(normal_step));
+            kept * self.direction[k] + share * normal_step + (slope * cosine_step) * normal
+        });
+        Self { direction: directions, ..*self }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A bundle of rays from (x, y) on a screen onto a unit sphere at the origin, or the plane
+    /// z = 1: where one meets it, and its direction after.
+    fn follow(x: f64, y: f64, is_round: bool, ratio: Option<f64>) -> (DVec3, DVec3) {
+        let eye = DVec3::new(0.3, -0.2, 4.0);
+        let direction = (DVec3::new(x, y, -1.0)).normalize();
+        let t = if is_round {
+            let half_b = eye.dot(direction);
+            -half_b - (half_b * half_b - eye.length_squared() + 1.0).sqrt()
+        } else {
+            (1.0 - eye.z) / direction.z
+        };
+        let point = eye + t * direction;
+        let normal = if is_round { point } else { DVec3::Z };
+        let cosine = -direction.dot(normal);
+        let after = match ratio {
+            None => direction + 2.0 * cosine * normal,
+            Some(ratio) => {
+                let behind = (1.0 - ratio * ratio * (1.0 - cosine * cosine)).sqrt();
+                ratio * direction + (ratio * cosine - behind) * normal
+            }
+        };
+        (point, after)
+    }
+
+    #[test]
+    fn it_is_the_difference_of_neighbouring_rays() {
+        let (x, y, step) = (0.03, 0.1, 1e-5);
+        for is_round in [false, true] {
+            for ratio in [None, Some(0.7), Some(1.4)] {
+                let (point, after) = follow(x, y, is_round, ratio);
+                let target = DVec3::new(x, y, -1.0);
+                let eye = DVec3::new(0.3, -0.2, 4.0);
+                let direction = target.normalize();
+                let (normal, curvature) = if is_round { (point, 1.0) } else { (DVec3::Z, 0.0) };
+                let met = Spread::of_camera(target, [DVec3::X, DVec3::Y]).transfer(
+                    direction,
+                    (point - eye).length(),
+                    normal,
+                );
+                let turned = match ratio {
+                    None => met.mirror(direction, normal, curvature),
+                    Some(ratio) => met.refract(direction, normal, curvature, ratio),
+                };
+                for (k, [dx, dy]) in [[step, 0.0], [0.0, step]].into_iter().enumerate() {
+                    let ahead = follow(x + dx, y + dy, is_round, ratio);
+                    let behind = follow(x - dx, y - dy, is_round, ratio);
+                    let points = (ahead.0 - behind.0) / (2.0 * step);
+                    let directions = (ahead.1 - behind.1) / (2.0 * step);
+                    let off = (turned.origin[k] - points)
+                        .length()
+                        .max((turned.direction[k] - directions).length());
+                    assert!(off < 1e-7, "{is_round} {ratio:?} {k}: {off:e}, {after}");
+                }
+            }
+        }
+    }
+}
