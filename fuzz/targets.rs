@@ -3,11 +3,18 @@
 
 #![allow(dead_code, reason = "each fuzz target calls one of them")]
 
+use std::{ops::ControlFlow, sync::LazyLock};
+
 use rtfarm_core::{
+    isa::Isa,
     mesh_file::read_mesh,
+    prepare::prepare,
+    prepared::{PreparedBytes, PreparedError, PreparedScene},
     read::{Severity, Style, draw_diagnostics, read_scene},
+    render::{Quality, Sampling, Settings, render_tile},
     scene::{MeshVertices, Scene, SolidNode},
     texture::read_texture,
+    tile::{Area, Size},
 };
 
 /// A scene text, which may name itself as a mesh or an image.
@@ -53,6 +60,98 @@ pub(crate) fn image(data: &[u8]) {
     if let Ok(texture) = read {
         assert!(texture.width > 0 && texture.height > 0);
         assert_eq!(texture.texels.len(), texture.width as usize * texture.height as usize);
+    }
+}
+
+/// What a prepared scene is made from before its bytes are changed: with all kinds of faces, and
+/// light that is mirrored, bent and let through; with solids and nothing else; with one triangle.
+const SCENES: [&str; 3] = [
+    include_str!("prepared/all.rt"),
+    include_str!("prepared/solids.rt"),
+    include_str!("prepared/triangle.rt"),
+];
+
+static PREPARED: LazyLock<Vec<Vec<u8>>> = LazyLock::new(|| {
+    let nothing = |_: &str| Err(std::io::ErrorKind::NotFound.into());
+    let scene = |text: &str| read_scene(text.as_bytes(), &nothing).scene.expect("no errors");
+    let block = |text: &&str| prepare(&scene(text)).expect("a plain scene").as_ref().to_vec();
+    SCENES.iter().map(block).collect()
+});
+
+/// Where a block keeps the hash of all that follows.
+const HASH: std::ops::Range<usize> = 16..48;
+
+/// A prepared scene with changed bytes, whose hash is right again: it is refused, or it gives the
+/// same picture on every instruction set.
+///
+/// The first byte chooses the scene, or says that a whole block follows. Then come changes of four
+/// bytes each: what kind and where, where, where, what. So they mean the same in every layout, or
+/// nearly.
+pub(crate) fn prepared(data: &[u8]) {
+    let Some((&first, changes)) = data.split_first() else { return };
+    let mut block = match PREPARED.get(usize::from(first)) {
+        Some(block) => block.clone(),
+        None => changes.to_vec(),
+    };
+    if usize::from(first) < SCENES.len() {
+        for change in changes.chunks_exact(4).take(64) {
+            change_block(&mut block, change);
+        }
+    }
+    if block.len() >= HASH.end {
+        let hash = blake3::hash(&block[HASH.end..]);
+        block[HASH].copy_from_slice(hash.as_bytes());
+    }
+    let scene = match PreparedScene::open(PreparedBytes::copy_from(&block)) {
+        Ok(scene) => scene,
+        Err(error) => return assert_ne!(error, PreparedError::Damaged, "the hash has moved"),
+    };
+    let sampling = Sampling::Fixed(1);
+    let quality = Quality { sampling, cutoff: 0.01, ..Quality::default() };
+    let settings = Settings { size: Size::new(4, 4).expect("a size"), quality };
+    let area = Area { x0: 0, y0: 0, width: 4, height: 4 };
+    let picture = |isa| {
+        let go_on = &mut || ControlFlow::Continue(());
+        let pixels = render_tile(&scene, &settings, area, isa, go_on).expect("nobody stops").pixels;
+        // One NaN is as good as another.
+        let bits = |channel: f32| if channel.is_nan() { 0 } else { channel.to_bits() };
+        pixels.into_iter().map(|pixel| pixel.map(bits)).collect::<Vec<_>>()
+    };
+    let scalar = picture(Isa::Scalar);
+    for isa in Isa::ALL.into_iter().filter(|isa| isa.is_supported()) {
+        assert_eq!(picture(isa), scalar, "{isa}");
+    }
+}
+
+/// Puts a number where it does most harm: a byte, a word, or an f64 that is hard to live with.
+fn change_block(block: &mut Vec<u8>, change: &[u8]) {
+    const WORDS: [u32; 8] = [0, 1, 2, 1 << 29, 1 << 31, u32::MAX - 1, u32::MAX, 0x7f80_0000];
+    const NUMBERS: [f64; 12] =
+        [0.0, -0.0, 1.0, -1.0, 0.5, 1e-300, 5e-324, 9e99, -9e99, 1e300, f64::INFINITY, f64::NAN];
+    let &[kind, low, high, what] = change else { return };
+    let place = usize::from(kind >> 3) << 16 | usize::from(high) << 8 | usize::from(low);
+    let place = place % block.len();
+    let mut put = |place: usize, bytes: &[u8]| {
+        if let Some(old) = block.get_mut(place..place + bytes.len()) {
+            old.copy_from_slice(bytes);
+        }
+    };
+    match kind & 7 {
+        0 => put(place, &[what]),
+        1 => put(place & !3, &WORDS[usize::from(what) % WORDS.len()].to_le_bytes()),
+        2 => put(place & !3, &u32::from(what).to_le_bytes()),
+        3 => put(place & !7, &NUMBERS[usize::from(what) % NUMBERS.len()].to_le_bytes()),
+        4 => put(place & !3, &(NUMBERS[usize::from(what) % NUMBERS.len()] as f32).to_le_bytes()),
+        5 => put(place & !3, &(1_u32 << (what % 32)).to_le_bytes()),
+        6 => {
+            // A word from nearby.
+            let from = (place & !3) + 4 * usize::from(what);
+            if let Some(word) = block.get(from..from + 4) {
+                let word = word.to_vec();
+                block[place & !3..(place & !3) + 4].copy_from_slice(&word);
+            }
+        }
+        _ => block.truncate(block.len() - usize::from(what).min(block.len() - 1)),
     }
 }
 

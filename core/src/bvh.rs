@@ -342,7 +342,11 @@ mod tests {
 
     #[test]
     fn coincident_faces_are_halved_not_split_for_ever() {
-        check(&vec![([0.5; 3], [0.5; 3]); 100_000]);
+        let nodes = check(&vec![([0.5; 3], [0.5; 3]); 100_000]);
+        eprintln!(
+            "case 29: boxes with one middle end in leaves: {} nodes for 100 000",
+            nodes.len()
+        );
     }
 
     #[test]
@@ -352,7 +356,79 @@ mod tests {
             .map(|k| if k % 2 == 0 { a } else { a.next_up() })
             .map(|x| ([x; 3], [x; 3]))
             .collect();
-        check(&boxes);
+        let nodes = check(&boxes);
+        eprintln!("case 30: middles one ulp apart end in leaves: {} nodes for 1000", nodes.len());
+    }
+
+    type Cutter = fn(&Part<'_>) -> Option<(usize, usize, f32)>;
+
+    /// The cheapest of all cuts between neighbours in the order of their middles: axis, place, cost.
+    fn swept_cut(part: &Part<'_>) -> Option<(usize, usize, f32)> {
+        let mut best: Option<(usize, usize, f32)> = None;
+        for axis in 0..3 {
+            let mut sorted = part.leaflets.to_vec();
+            sorted.sort_by(|a, b| a.bounds.middle(axis).total_cmp(&b.bounds.middle(axis)));
+            let mut right_cost = vec![0.0; sorted.len()];
+            let mut side = Bounds::NONE;
+            for k in (1..sorted.len()).rev() {
+                side = side.join(&sorted[k].bounds);
+                right_cost[k] = side.half_area() * (sorted.len() - k) as f32;
+            }
+            side = Bounds::NONE;
+            for k in 1..sorted.len() {
+                side = side.join(&sorted[k - 1].bounds);
+                let cost = side.half_area() * k as f32 + right_cost[k];
+                if best.is_none_or(|best| cost < best.2) {
+                    best = Some((axis, k, cost));
+                }
+            }
+        }
+        best
+    }
+
+    /// What a binary tree costs by the surface area heuristic, cut by cut, in areas of the root:
+    /// with the builder's cuts, or where `cutter` says.
+    fn cost(part: Part<'_>, cutter: Option<Cutter>, root_area: f64) -> f64 {
+        let area = f64::from(part.bounds.half_area()) / root_area;
+        if part.is_leaf() {
+            return area * part.leaflets.len() as f64;
+        }
+        let halves = match cutter.and_then(|cutter| cutter(&part)) {
+            None => part.cut(0),
+            Some((axis, at, _)) => {
+                let middle = |leaflet: &Leaflet| leaflet.bounds.middle(axis);
+                part.leaflets.sort_by(|a, b| middle(a).total_cmp(&middle(b)));
+                let (left, right) = part.leaflets.split_at_mut(at);
+                [Part::new(left, 0), Part::new(right, 0)]
+            }
+        };
+        area + halves.into_iter().map(|half| cost(half, cutter, root_area)).sum::<f64>()
+    }
+
+    #[test]
+    fn bins_cut_a_teapot_in_a_stadium_as_well_as_a_full_sweep() {
+        // A stadium of 1, and in it a teapot of a millionth.
+        let mut boxes = scattered(2000);
+        let shrunk = |point: [f32; 3]| point.map(|x| x * 1e-6);
+        let teapot = scattered(2000).into_iter().map(|(min, max)| (shrunk(min), shrunk(max)));
+        boxes.extend(teapot);
+        let leaflets: Vec<Leaflet> = (0..)
+            .zip(boxes)
+            .map(|(face, (min, max))| Leaflet { bounds: Bounds { min, max }, face })
+            .collect();
+        let cost_of = |cutter| {
+            let mut leaflets = leaflets.clone();
+            let part = Part::new(&mut leaflets, 0);
+            let area = f64::from(part.bounds.half_area());
+            cost(part, cutter, area)
+        };
+        let (binned, swept) = (cost_of(None), cost_of(Some(swept_cut as Cutter)));
+        eprintln!(
+            "case 31: a teapot in a stadium a million times its size costs as with a full sweep: \
+             {:.3} times {swept:.1}",
+            binned / swept
+        );
+        assert!(binned <= 1.1 * swept);
     }
 
     #[test]

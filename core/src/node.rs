@@ -84,7 +84,7 @@ pub(crate) struct BoxRay {
     near_origin: [f32; 3],
     far_origin: [f32; 3],
     inverse: [f32; 3],
-    /// The stretch of the ray that counts.
+    /// The stretch of the ray that counts; `high` is NaN for a ray that meets nothing.
     low: f32,
     high: f32,
     /// Turns a distance along the ray into the boxes' frame: (t - start) · scale.
@@ -138,6 +138,16 @@ impl BoxRay {
             ray.far[axis] = if forward { axis + 3 } else { axis };
             ray.near_origin[axis] = if forward { high } else { low };
             ray.far_origin[axis] = if forward { low } else { high };
+        }
+        // A ray that is nowhere, or goes nowhere, meets nothing, above all no boxes of unused children: with a NaN
+        // or an infinity it would.
+        let is_somewhere = |axis: usize| {
+            ray.inverse[axis].abs() > 0.0
+                && ray.near_origin[axis].is_finite()
+                && ray.far_origin[axis].is_finite()
+        };
+        if direction == DVec3::ZERO || !(0..3).all(is_somewhere) {
+            ray.high = f32::NAN;
         }
         ray
     }

@@ -114,7 +114,8 @@ struct Section {
     count: u64,
 }
 
-/// The eye and the screen as seen from it.
+/// The eye and the screen as seen from it. The screen only gives directions, so it has a scale of
+/// its own: one that is nothing beside the scene still does not underflow.
 #[derive(Debug, Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
 #[repr(C)]
 pub(crate) struct Camera {
@@ -125,6 +126,17 @@ pub(crate) struct Camera {
     pub(crate) right: [f64; 3],
     /// From the top left corner to the bottom left one.
     pub(crate) down: [f64; 3],
+}
+
+impl Camera {
+    fn with_screen_of_one(self) -> Self {
+        let screen = [self.top_left, self.right, self.down].map(DVec3::from_array);
+        let largest =
+            screen.map(|vector| vector.abs().max_element()).into_iter().fold(0.0, f64::max);
+        let scale = power_of_two_below_inverse(largest);
+        let [top_left, right, down] = screen.map(|vector| (vector * scale).to_array());
+        Self { top_left, right, down, ..self }
+    }
 }
 
 #[derive(Debug, Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
@@ -589,7 +601,7 @@ pub(crate) fn assemble(
         magic: MAGIC,
         version: VERSION,
         byte_order: BYTE_ORDER,
-        camera,
+        camera: camera.with_screen_of_one(),
         lighting,
         frame,
         scale,
@@ -710,7 +722,13 @@ fn check(view: &View<'_>) -> Result<(), &'static str> {
     for (index, node) in view.nodes.iter().enumerate() {
         ensure(levels[index] > 0, "a node without a parent")?;
         ensure(node.planes.as_flattened().iter().all(|x| !x.is_nan()), "a box")?;
-        for &child in node.children.iter().filter(|&&child| child != Child::NONE) {
+        for (k, &child) in node.children.iter().enumerate() {
+            if child == Child::NONE {
+                // Its box is what keeps rays from going there, to the root again.
+                let is_empty = |side: usize| node.planes[side][k] == Node::EMPTY.planes[side][k];
+                ensure((0..6).all(is_empty), "a box")?;
+                continue;
+            }
             if child.is_leaf() {
                 ensure(child.items().end <= view.items.len(), "a leaf")?;
                 continue;
@@ -777,7 +795,8 @@ fn check(view: &View<'_>) -> Result<(), &'static str> {
         ensure(last_rank <= Child::ITEM_LIMIT as u64, "a solid")?;
     }
     for light in view.lights {
-        ensure(finite(&light.position) && finite(&light.intensity), "a light")?;
+        let is_finite = light.intensity.iter().all(|channel| channel.is_finite());
+        ensure(finite(&light.position) && is_finite, "a light")?;
         let end = light.touches_first as usize + light.touches_count as usize;
         ensure(end <= view.touches.len(), "a light")?;
     }

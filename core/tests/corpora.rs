@@ -2,6 +2,8 @@
 
 use std::{fs, path::Path};
 
+use rtfarm_oracle::random::Random;
+
 #[path = "../../fuzz/targets.rs"]
 mod targets;
 
@@ -42,4 +44,22 @@ fn ply_files_hold() {
 #[test]
 fn images_hold() {
     check_corpus("image", targets::image);
+}
+
+#[test]
+fn prepared_scenes_with_changed_bytes_hold() {
+    check_corpus("prepared", targets::prepared);
+}
+
+#[test]
+fn prepared_scenes_with_a_few_words_changed_anywhere_hold() {
+    for seed in 0..3000 {
+        let mut random = Random::new(seed);
+        let mut input = vec![random.below(3) as u8];
+        for _ in 0..4 * (1 + random.below(3)) {
+            input.push(random.bits() as u8);
+        }
+        // Small blocks: the upper bits of a place only wrap around.
+        targets::prepared(&input);
+    }
 }

@@ -2,13 +2,15 @@
 
 #![expect(clippy::float_cmp, reason = "what holds exactly is tested exactly")]
 
+mod long;
 mod parts;
 mod studio;
 
 use std::fmt::Write;
 
 use glam::DVec3;
-use parts::{join, rays, sphere, upright};
+use long::{random, rays, tell};
+use parts::{join, sphere, upright};
 use rtfarm_core::{
     isa::Isa,
     prepared::{PreparedBytes, PreparedScene},
@@ -80,7 +82,7 @@ fn point_on_sphere(scene: &Scene, size: u32, pixel: usize, sphere: &Sphere) -> O
 #[test]
 fn a_light_on_a_flat_surface_gives_it_nothing() {
     // A tilted wall whose numbers are not round, as triangles, alone or two, and a quadrangle.
-    let mut random = Random::new(4);
+    let mut random = random(4);
     for seed in 0..20 {
         let (u, v) = (DVec3::new(2.0, 0.1, 0.3), DVec3::new(-0.2, 2.0, 0.5));
         let nudge = random.in_cube() * 0.1;
@@ -101,12 +103,13 @@ fn a_light_on_a_flat_surface_gives_it_nothing() {
             }
         }
     }
+    tell(56, "a light on a flat surface gives it nothing", "60 surfaces of 1600 pixels");
 }
 
 #[test]
 fn a_light_on_a_sphere_gives_it_nothing_outside_or_inside() {
     for center in [DVec3::ZERO, DVec3::new(0.1, 0.2, 4.3)] {
-        let mut random = Random::new(6);
+        let mut random = random(6);
         for seed in 0..20 {
             let light = center + random.direction();
             let scene = scene(&lamp(light.x, light.y, light.z), &sphere(center, 1.0, "white"));
@@ -115,6 +118,7 @@ fn a_light_on_a_sphere_gives_it_nothing_outside_or_inside() {
             }
         }
     }
+    tell(56, "a light on a sphere gives it nothing", "40 spheres of 1600 pixels");
 }
 
 #[test]
@@ -122,6 +126,11 @@ fn a_light_at_a_point_that_a_ray_hits_gives_it_nothing() {
     // The middle pixel's ray runs along z.
     let scene = scene(&lamp(0.0, 0.0, 0.0), &wall(0.0, 9.0, "white"));
     assert!(picture(&scene, &settings(41, 41, 1)).into_iter().all(|pixel| pixel == BLACK));
+    tell(
+        58,
+        "a light at the point that a ray hits gives it nothing",
+        "1681 pixels, all dark and finite",
+    );
 }
 
 #[test]
@@ -142,11 +151,16 @@ fn a_light_on_a_surface_still_lights_what_faces_it() {
     for (found, truth) in [(edge, at(20, 0)), (corner, at(3, 0))] {
         assert!((found[0] - truth).abs() < 1e-6 * truth, "{found:?}, truly {truth}");
     }
+    tell(
+        27,
+        "a light on a surface lights what faces it, without a shadow of that surface",
+        "right within 1e-6",
+    );
 }
 
 #[test]
 fn a_light_inside_an_opaque_sphere_leaves_all_outside_exactly_dark() {
-    let mut random = Random::new(2);
+    let mut random = random(2);
     let side = side(10_000 / 4);
     for seed in 0..30 {
         let (center, radius) = (random.in_cube() * 0.3, random.between(0.2, 1.0));
@@ -159,11 +173,16 @@ fn a_light_inside_an_opaque_sphere_leaves_all_outside_exactly_dark() {
             assert_eq!(pixel, BLACK, "{seed}: pixel {k}");
         }
     }
+    tell(
+        57,
+        "outside an opaque sphere that holds a light all is exactly dark",
+        format!("{} pixels", 30 * side * side),
+    );
 }
 
 #[test]
 fn a_light_inside_an_opaque_sphere_lights_all_of_its_inside() {
-    let mut random = Random::new(3);
+    let mut random = random(3);
     let side = side(10_000);
     for seed in 0..10 {
         let center = DVec3::new(0.0, 0.0, 5.0) + random.in_cube() * 0.3;
@@ -195,7 +214,7 @@ fn shells(middle: DVec3) -> Vec<(&'static str, String)> {
 
 #[test]
 fn a_light_inside_a_shell_of_a_solid_leaves_all_outside_exactly_dark() {
-    let mut random = Random::new(12);
+    let mut random = random(12);
     let side = side(1000);
     let mut count = 0;
     for seed in 0..20 {
@@ -212,12 +231,12 @@ fn a_light_inside_a_shell_of_a_solid_leaves_all_outside_exactly_dark() {
             }
         }
     }
-    eprintln!("{count} places outside are exactly dark");
+    tell(57, "outside a shell that holds a light all is exactly dark", format!("{count} places"));
 }
 
 #[test]
 fn a_light_inside_a_shell_of_a_solid_lights_all_of_its_inside() {
-    let mut random = Random::new(13);
+    let mut random = random(13);
     let side = side(2000);
     let (mut count, mut worst) = (0, 0.0_f64);
     for seed in 0..10 {
@@ -238,7 +257,11 @@ fn a_light_inside_a_shell_of_a_solid_lights_all_of_its_inside() {
             }
         }
     }
-    eprintln!("{count} places inside are lit; in round cavities right within {worst:.1e}");
+    tell(
+        57,
+        "inside a shell that holds a light all is lit",
+        format!("{count} places, in round cavities right within {worst:.1e}"),
+    );
     assert!(worst < 1e-6);
 }
 
@@ -257,6 +280,7 @@ fn a_light_at_the_eye_leaves_no_shadow_to_be_seen() {
         let error = (f64::from(pixel[0]) - truth).abs() / truth;
         assert!(error < 1e-6, "pixel {k} is {pixel:?}, truly {truth}");
     }
+    tell(58, "a light at the eye leaves no shadow to be seen", "4096 pixels, right within 1e-6");
 }
 
 #[test]
@@ -285,6 +309,11 @@ fn a_sphere_has_no_acne_up_to_its_terminator() {
         }
         assert!(lit > 50, "{what}: {lit} pixels are lit");
     }
+    tell(
+        59,
+        "a sphere has no acne up to its terminator",
+        "5 spheres of 9216 pixels, no wrong pixel",
+    );
 }
 
 /// Of faces in one place only the first is seen, without speckles or acne: the picture is that of
@@ -307,7 +336,7 @@ fn check_first_wins(what: &str, first: &str, others: &str) {
 
 /// The corners of a square, round numbers first, then tilted in the second half.
 fn squares() -> Vec<(String, [DVec3; 4])> {
-    let mut random = Random::new(9);
+    let mut random = random(9);
     let square = |place: DVec3, u: DVec3, v: DVec3| [place, place + u, place + u + v, place + v];
     let straight = square(DVec3::new(-1.0, -1.0, 0.0), DVec3::X * 2.0, DVec3::Y * 2.0);
     let round = square(DVec3::new(-1.0, -1.0, 0.5), DVec3::new(2.0, 0.25, -1.0), DVec3::Y * 2.0);
@@ -322,13 +351,14 @@ fn squares() -> Vec<(String, [DVec3; 4])> {
 
 #[test]
 fn the_first_of_equal_spheres_wins() {
-    let mut random = Random::new(8);
+    let mut random = random(8);
     for _ in 0..5 {
         let (center, radius) = (random.in_cube() * 0.5, random.between(0.5, 1.5));
         let [red, green] = ["red", "green"].map(|material| sphere(center, radius, material));
         check_first_wins("spheres", &red, &(green.clone() + &green));
         check_first_wins("spheres", &green, &red);
     }
+    tell(66, "of equal spheres the first is seen", "10 pictures, no wrong pixel");
 }
 
 #[test]
@@ -340,6 +370,7 @@ fn the_first_of_equal_triangles_wins_wherever_its_corners_begin() {
         check_first_wins(&what, &polygon(&[a, b, c], "red"), &copies);
         check_first_wins(&what, &polygon(&[a, c, b], "red"), &copies);
     }
+    tell(66, "of equal triangles the first is seen", "44 pictures, no wrong pixel");
 }
 
 #[test]
@@ -348,6 +379,7 @@ fn the_first_of_equal_quadrangles_wins_wherever_its_corners_begin() {
         let copies = polygon(&[b, c, d, a], "green") + &polygon(&[d, c, b, a], "white");
         check_first_wins(&what, &polygon(&[a, b, c, d], "red"), &copies);
     }
+    tell(66, "of equal quadrangles the first is seen", "22 pictures, no wrong pixel");
 }
 
 #[test]
@@ -362,6 +394,11 @@ fn the_first_wins_of_a_quadrangle_and_triangles_over_it() {
         let label = [b, a, d].map(|corner| middle + (corner - middle) / 4.0);
         check_first_wins(&what, &quadrangle, &polygon(&label, "white"));
     }
+    tell(
+        66,
+        "of a quadrangle and triangles over it the first is seen",
+        "6 pictures, no wrong pixel",
+    );
 }
 
 #[test]
@@ -376,6 +413,7 @@ fn of_planes_that_are_nearly_one_the_nearer_is_seen_and_shades_the_other() {
         let alone = picture(&scene(&lights, &near), &settings);
         assert!(both == alone);
     }
+    tell(60, "of planes 1e-7 apart the nearer is seen and lit", "12 800 pixels, no wrong pixel");
 }
 
 #[test]
@@ -387,6 +425,7 @@ fn a_sky_of_a_hundred_million_is_seen() {
     let green = seen.iter().filter(|pixel| **pixel == [0.0, 0.5, 0.0]).count();
     assert_eq!((seen[0], seen[32 * 64 + 32]), ([0.0, 0.5, 0.0], [0.5, 0.0, 0.0]));
     assert_eq!(red + green, seen.len());
+    tell(61, "a sky of 1e8 is seen", "4096 pixels, no wrong pixel");
 }
 
 /// The six sides of a cube around the eye of [`scene`], turned outwards.
@@ -432,6 +471,7 @@ fn a_needle_of_a_quadrangle_is_whole() {
         // At z = 0 the screen is 4 x 4: the needle takes the middle half of it.
         assert_eq!(white, 32 * 32, "{width}");
     }
+    tell(32, "needles of quadrangles down to 1e-12 wide are whole", "no pixel lacks");
 }
 
 /// The faces of boxes without thickness and rays that run in their planes or straight at them.
@@ -480,6 +520,10 @@ fn rays_along_the_axes_meet_flat_boxes_whatever_the_sign_of_their_zeros() {
             assert_eq!(found.map(|hit| (hit.t, hit.primitive)), truth, "{probe:?}");
         }
     }
+    let count = format!("{} rays, with every instruction set", probes.len());
+    tell(21, "rays along the axes, from the planes of boxes, meet what they should", &count);
+    tell(22, "a zero with a sign gives the hits of one without", &count);
+    tell(23, "boxes without thickness are met", count);
 }
 
 #[test]
@@ -500,6 +544,7 @@ fn pictures_may_be_one_pixel_or_as_wide_as_can_be() {
         let last = pixels(&prepared(&scene), &settings(width, height, 1), corner);
         assert_eq!(last, [BLACK]);
     }
+    tell(63, "pictures of 1 x 1, 65 535 x 1 and 1 x 65 535 are right", "no wrong pixel");
 }
 
 /// A sphere of some size somewhere, alone or the only part of a solid.
@@ -533,7 +578,7 @@ fn balls(random: &mut Random) -> Vec<Ball> {
 
 #[test]
 fn a_ray_from_inside_a_sphere_goes_out_once() {
-    let mut random = Random::new(16);
+    let mut random = random(16);
     let (mut count, mut worst) = (0, 0.0_f64);
     for ball in balls(&mut random) {
         let probes: Vec<Probe> = (0..rays(100_000) / 40)
@@ -557,7 +602,11 @@ fn a_ray_from_inside_a_sphere_goes_out_once() {
             count += 1;
         }
     }
-    eprintln!("{count} rays go out once, at {:.1} ulp of the sphere or nearer", 16.0 * worst);
+    tell(
+        16,
+        "a ray from inside a sphere goes out once",
+        format!("{count} rays, at {:.1} ulp of it or nearer", 16.0 * worst),
+    );
     assert!(worst < 1.0);
 }
 
@@ -590,7 +639,7 @@ fn starts_on(ball: &Ball, random: &mut Random, count: usize, ahead: f64) -> Vec<
 
 #[test]
 fn a_ray_that_leaves_a_sphere_outwards_never_meets_it_again() {
-    let mut random = Random::new(17);
+    let mut random = random(17);
     let (mut count, mut grazing) = (0, 0);
     for ball in balls(&mut random) {
         let starts = starts_on(&ball, &mut random, rays(100_000) / 40, 1.0);
@@ -602,13 +651,17 @@ fn a_ray_that_leaves_a_sphere_outwards_never_meets_it_again() {
         count += probes.len();
         grazing += starts.iter().filter(|start| start.1.abs() < 1e-6 * ball.radius).count();
     }
-    eprintln!("0 of {count} rays meet the sphere that they leave, {grazing} of them graze it");
+    tell(
+        17,
+        "a ray that leaves a sphere outwards never meets it",
+        format!("0 of {count} rays, {grazing} of them grazing"),
+    );
     assert!(count > rays(95_000));
 }
 
 #[test]
 fn a_ray_that_leaves_a_sphere_inwards_always_meets_its_other_side() {
-    let mut random = Random::new(18);
+    let mut random = random(18);
     let (mut count, mut worst) = (0, 0.0_f64);
     for ball in balls(&mut random) {
         let starts = starts_on(&ball, &mut random, rays(100_000) / 40, -1.0);
@@ -625,13 +678,17 @@ fn a_ray_that_leaves_a_sphere_inwards_always_meets_its_other_side() {
             count += 1;
         }
     }
-    eprintln!("0 of {count} rays are lost; they end within {:.1} ulp of the sphere", 16.0 * worst);
+    tell(
+        18,
+        "a ray that leaves a sphere inwards meets its other side",
+        format!("0 of {count} lost; they end within {:.1} ulp of it", 16.0 * worst),
+    );
     assert!(worst < 1.0);
 }
 
 #[test]
 fn a_ray_mirrored_a_thousand_times_inside_a_ball_keeps_its_chord() {
-    let mut random = Random::new(19);
+    let mut random = random(19);
     let (mut count, mut worst) = (0, 0.0_f64);
     for _ in 0..rays(100_000) / 1000 {
         let (center, radius) = (random.in_cube(), random.between(0.5, 2.0));

@@ -2,21 +2,22 @@
 
 #![expect(clippy::float_cmp, reason = "what holds exactly is tested exactly")]
 
+mod long;
 mod parts;
 mod studio;
 
 use std::{fmt::Write, ops::ControlFlow, sync::Arc};
 
 use glam::DVec3;
-use parts::{join, rays, sphere, upright};
+use long::{few_rays, random, rays, tell};
+use parts::{join, sphere, upright};
 use rtfarm_core::{
     isa::Isa,
     render::{RenderedTile, render_tile},
     scene::{Mesh, MeshShape, MeshVertices, Place, Scene},
 };
 use rtfarm_oracle::{
-    Settings as OracleSettings, closed_forms::irradiance, eye_direction, random::Random,
-    reference_picture,
+    Settings as OracleSettings, closed_forms::irradiance, eye_direction, reference_picture,
 };
 use studio::{picture, pixels, prepared, read, settings, whole};
 
@@ -78,12 +79,13 @@ fn parallel_mirrors_add_up_a_geometric_series_and_report_the_rest() {
             assert!(error < 1e-7, "{share}: {pixel:?}, truly {}", 1.0 - rest);
         }
     }
+    tell(54, "parallel mirrors add up a geometric series", "right within a rounding");
 }
 
 #[test]
 fn a_mirror_shows_the_mirrored_scene() {
     for seed in 0..5 {
-        let mut random = Random::new(seed);
+        let mut random = random(seed);
         let mut things = Vec::new();
         for _ in 0..12 {
             let place = DVec3::new(0.0, 0.0, 9.0) + random.in_cube() * 3.0;
@@ -118,7 +120,7 @@ fn a_mirror_shows_the_mirrored_scene() {
 
 #[test]
 fn a_white_world_stays_white_whatever_mirrors_and_bends() {
-    let mut random = Random::new(7);
+    let mut random = random(7);
     for seed in 0..10 {
         let mut materials = String::new();
         for (name, reflect) in [("a", 0.0), ("b", 0.4), ("c", 0.1)] {
@@ -150,6 +152,7 @@ fn a_ratio_of_one_bends_nothing_to_the_bit() {
         rendered(&scene(&glass, "ambient 0.5 point coords 3 3 4 power 9 endpoint", &things), side())
     };
     assert!(with("refract 1") == with("") && with("refract 0") == with(""));
+    tell(53, "a ratio of 1 bends nothing to the bit", "no wrong pixel");
 }
 
 #[test]
@@ -351,7 +354,11 @@ fn slabs_nested_and_overlapping_bend_at_each_face_by_its_own_ratio_and_side() {
         assert!(asked > rays(4_000), "{what}: {asked} rays arrive");
         (count, worst) = (count + asked, worst.max(error));
     }
-    eprintln!("{count} rays arrive where slabs send them within {worst:.1e} of the light");
+    tell(
+        50,
+        "nested and overlapping slabs bend at each face",
+        format!("{count} rays, right within {worst:.1e} of the light"),
+    );
 }
 
 #[test]
@@ -620,7 +627,7 @@ fn a_light_guide_keeps_light_and_its_way_over_dozens_of_total_reflections() {
 #[test]
 fn light_that_never_gets_out_adds_up_a_geometric_series_and_no_more() {
     // Near its skin a ball turns all light back for ever: of each meeting it shows a share.
-    let mut random = Random::new(52);
+    let mut random = random(52);
     let (mut count, mut worst) = (0, 0.0_f64);
     for alpha in [0.0, 0.01, 0.05, 0.5] {
         for _ in 0..10 {
@@ -648,8 +655,10 @@ fn light_that_never_gets_out_adds_up_a_geometric_series_and_no_more() {
             count += tile.pixels.len();
         }
     }
-    eprintln!(
-        "{count} rays bring no more light than there is; what stays in is right within {worst:.1e}"
+    tell(
+        52,
+        "light that never gets out is no more than there is",
+        format!("{count} rays; what stays in is right within {worst:.1e}"),
     );
     assert!(worst < 1e-6);
 }
@@ -669,7 +678,7 @@ fn check_grazed(what: &str, scene: &Scene, side: u64) -> u64 {
 
 #[test]
 fn no_ray_goes_below_a_mirror_that_it_grazes() {
-    let mut random = Random::new(55);
+    let mut random = random(55);
     let mut count = 0;
     let words = |p: DVec3| format!("{:?} {:?} {:?} ", p.x, p.y, p.z);
     for seed in 0..20 {
@@ -735,7 +744,7 @@ fn no_ray_goes_below_a_mirror_that_it_grazes() {
             count += check_grazed("a ball", &scene, side_of(2_000));
         }
     }
-    eprintln!("0 of {count} rays go below the mirror that they graze at 89.9999°");
+    tell(55, "no ray goes below a mirror that it grazes at 89.9999°", format!("0 of {count}"));
 }
 
 /// The picture is the oracle's; tells how many pixels differ.
@@ -789,19 +798,19 @@ fn an_eye_inside_glass_or_a_solid_sees_what_the_oracle_sees() {
         ("a shell's wall", join("difference", &[&cube(1.2, "glass"), &ball(DVec3::X, 0.9)])),
     ] {
         let scene = scene(materials, lights, &(around.clone() + &geometry));
-        let side = side_of(400);
+        let side = few_rays(400).isqrt() as u64;
         let differing = difference_from_oracle(&scene, side);
         assert!(differing * 500 <= (side * side) as usize, "{what}: {differing} pixels differ");
         count += side * side;
     }
-    eprintln!("{count} pixels seen from inside are the oracle's");
+    tell(49, "an eye inside glass or a solid sees what the oracle sees", format!("{count} pixels"));
 }
 
 #[test]
 fn at_the_critical_angle_light_turns_back_once_and_stays_a_number() {
     // Up to the angle light goes through and, ever flatter, to a green wall that is the darker
     // the higher up; from there on it turns back to a red ceiling.
-    let mut random = Random::new(51);
+    let mut random = random(51);
     let (width, mut count, mut worst) = (4096, 0, 0.0_f64);
     for run in 0..rays(100_000) / 4096 {
         let ratio = if run < 4 { 1.5 } else { random.between(1.1, 3.0) };
@@ -837,7 +846,9 @@ fn at_the_critical_angle_light_turns_back_once_and_stays_a_number() {
         worst = worst.max(angle_error);
         count += seen.len();
     }
-    eprintln!(
-        "{count} rays, each a number; windows from 1e-3 down turn at the angle within {worst:.1e}"
+    tell(
+        51,
+        "at the critical angle light turns back once and stays a number",
+        format!("{count} rays; windows from 1e-3 down turn at the angle within {worst:.1e}"),
     );
 }

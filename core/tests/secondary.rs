@@ -1,6 +1,5 @@
 //! Light that faces send on to others, against closed forms. Every test prints how far off it is.
 
-#[expect(dead_code, reason = "other tests need the rest")]
 mod parts;
 #[expect(dead_code, reason = "other tests need the rest")]
 mod studio;

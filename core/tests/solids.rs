@@ -3,13 +3,15 @@
 //! `RTFARM_RAYS=100` takes a hundred times as many rays.
 
 mod judge;
+mod long;
 mod parts;
 
 use std::{f64::consts::PI, thread};
 
 use glam::{DMat3, DVec3};
 use judge::check_against_oracle;
-use parts::{join, parallelepiped, rays, sphere, upright};
+use long::{few_rays, random, rays, tell};
+use parts::{join, parallelepiped, sphere, upright};
 use rayon::prelude::*;
 use rtfarm_core::{
     isa::Isa,
@@ -148,10 +150,10 @@ fn random_tree(random: &mut Random, is_snapped: bool, depth: u32) -> String {
 /// Two ways to write one set are crossed alike by random rays.
 fn check_equal_sets(what: &str, write: impl Fn([&str; 3]) -> [String; 2]) {
     let trees = 50;
-    let each = rays(100_000) / trees;
+    let each = few_rays(100_000) / trees;
     let mut crossed = 0;
     for seed in 0..trees as u64 {
-        let mut random = Random::new(seed);
+        let mut random = random(seed);
         let is_snapped = seed % 2 == 1;
         let [a, b, c] = [0, 1, 2].map(|_| random_tree(&mut random, is_snapped, 2));
         let [left, right] = write([&a, &b, &c]);
@@ -170,7 +172,7 @@ fn check_equal_sets(what: &str, write: impl Fn([&str; 3]) -> [String; 2]) {
             }
         }
     }
-    assert!(crossed > rays(5_000), "{what}: {crossed} crossings in all");
+    assert!(crossed > few_rays(5_000), "{what}: {crossed} crossings in all");
 }
 
 /// A box around everything: what is not in a set is in this less the set.
@@ -255,7 +257,7 @@ fn check_same_bits(what: &str, left: &str, right: &str, random: &mut Random, cou
 #[test]
 fn a_set_with_itself_is_itself_exactly_and_less_itself_nothing() {
     for seed in 0..20 {
-        let mut random = Random::new(seed);
+        let mut random = random(seed);
         let a = random_leaf(&mut random, seed % 2 == 1);
         let count = rays(100_000) / 20;
         let alone = alone(&a);
@@ -269,11 +271,12 @@ fn a_set_with_itself_is_itself_exactly_and_less_itself_nothing() {
             assert!(hits.iter().all(Option::is_none), "{seed}: a skin is left");
         }
     }
+    tell(45, "A with A is A to the bit, A less A nothing", format!("{} rays", 3 * rays(100_000)));
 }
 
 #[test]
 fn a_box_cut_with_a_box_is_a_box() {
-    let mut random = Random::new(2);
+    let mut random = random(2);
     for _ in 0..20 {
         let [a, b] = [random.in_cube() * 0.3, random.in_cube() * 0.3];
         let (low, high) = (a - 1.0, b + 1.0);
@@ -314,7 +317,7 @@ fn turned(turn: &DMat3, low: DVec3, high: DVec3) -> String {
 #[test]
 fn solids_that_touch_have_no_face_between_them() {
     for seed in 0..20 {
-        let mut random = Random::new(seed);
+        let mut random = random(seed);
         let turn = if seed == 0 { DMat3::IDENTITY } else { turn(&mut random) };
         let (low, high) = (DVec3::splat(-1.0), DVec3::new(0.9, 1.1, 0.7));
         let seams = [random.between(-0.8, 0.0), random.between(0.1, 0.6)];
@@ -346,12 +349,17 @@ fn solids_that_touch_have_no_face_between_them() {
             }
         }
     }
+    tell(
+        46,
+        "solids that touch have no face between them",
+        format!("0 inner hits of {} rays", rays(100_000)),
+    );
 }
 
 #[test]
 fn a_hole_whose_ends_are_flush_has_no_skin() {
     for seed in 0..20 {
-        let mut random = Random::new(seed);
+        let mut random = random(seed);
         let turn = if seed == 0 { DMat3::IDENTITY } else { turn(&mut random) };
         let plate = turned(&turn, DVec3::new(-1.0, -1.0, -0.3), DVec3::new(1.0, 1.0, 0.4));
         let plug = turned(&turn, DVec3::new(-0.5, -0.5, -0.3), DVec3::new(0.5, 0.5, 0.4));
@@ -374,6 +382,11 @@ fn a_hole_whose_ends_are_flush_has_no_skin() {
             }
         }
     }
+    tell(
+        44,
+        "a hole whose ends are flush has no skin",
+        format!("0 speckles of {} rays", 2 * rays(100_000)),
+    );
 }
 
 #[test]
@@ -390,7 +403,7 @@ fn both_walls_of_a_shell_one_billionth_thick_are_met() {
         ],
     );
     let [round, square] = [opened(&round), opened(&square)];
-    let mut random = Random::new(6);
+    let mut random = random(6);
     let mut worst = 0.0_f64;
     for _ in 0..rays(100_000) / BATCH {
         let probes: Vec<Probe> = (0..BATCH)
@@ -410,7 +423,11 @@ fn both_walls_of_a_shell_one_billionth_thick_are_met() {
             }
         }
     }
-    eprintln!("the thickness of the shell is right within {worst:.1e}");
+    tell(
+        47,
+        "both walls of a shell of 1e-9 are met",
+        format!("its thickness is right within {worst:.1e}"),
+    );
     assert!(worst < 1e-14);
 }
 
@@ -432,7 +449,7 @@ fn a_solid_nested_a_thousand_deep_is_crossed_at_each_level_on_a_small_stack() {
     }
     let scenes = [opened(&right), opened(&left)];
     let trace = move || {
-        let mut random = Random::new(1);
+        let mut random = random(1);
         for scene in scenes {
             for _ in 0..5 {
                 let direction = random.direction();
@@ -451,6 +468,7 @@ fn a_solid_nested_a_thousand_deep_is_crossed_at_each_level_on_a_small_stack() {
         }
     };
     thread::Builder::new().stack_size(128 << 10).spawn(trace).unwrap().join().unwrap();
+    tell(48, "a solid nested 1000 deep is crossed at each level", "on a small stack");
 }
 
 /// The volume by the lengths of parallel rays inside it.
@@ -499,7 +517,7 @@ fn caps_lenses_and_bored_boxes_have_the_volumes_of_the_formulas() {
         ("cube less an eighth", join("difference", &[&cube, &corner]), 8.0 - PI / 48.0),
     ] {
         for along in [DVec3::Z, DVec3::new(0.36, 0.48, 0.8)] {
-            let count = rays(100_000);
+            let count = few_rays(100_000);
             let error = (measured_volume(&solid, along, count) / truth - 1.0).abs();
             eprintln!("{what}: {error:.1e} off with {count} rays");
             assert!(error < 100.0 / count as f64, "{what} along {along}: {error:e}");
@@ -510,7 +528,7 @@ fn caps_lenses_and_bored_boxes_have_the_volumes_of_the_formulas() {
 #[test]
 fn a_parallelepiped_has_no_cracks_at_its_edges_and_corners() {
     for seed in 0..50 {
-        let mut random = Random::new(seed);
+        let mut random = random(seed);
         let edges = match seed % 3 {
             // Sheared until its edges are as good as one: a condition of 1e8.
             0 => [DVec3::X, DVec3::new(1.0, 1e-8, 0.0), DVec3::new(0.3, 0.2, 1.0)],
@@ -538,7 +556,7 @@ fn a_parallelepiped_has_no_cracks_at_its_edges_and_corners() {
 fn a_sheared_box_is_met_where_the_oracle_meets_it_within_its_condition() {
     let runs = 100;
     let worst_of_run = |run: usize| {
-        let mut random = Random::new(run as u64);
+        let mut random = random(run as u64);
         let condition = [1.0, 1e2, 1e4, 1e6, 1e8][run % 5];
         let [outer, inner] = [turn(&mut random), turn(&mut random)];
         let sizes =
@@ -550,7 +568,7 @@ fn a_sheared_box_is_met_where_the_oracle_meets_it_within_its_condition() {
         let text = if run.is_multiple_of(2) { box_text } else { alone(&box_text) };
         let scene = read(&text);
         let (block, oracle) = (opened(&text), Oracle::new(&scene));
-        let probes: Vec<Probe> = (0..rays(100_000) / runs)
+        let probes: Vec<Probe> = (0..few_rays(100_000) / runs)
             .map(|_| {
                 let inside: DVec3 = edges.into_iter().map(|edge| edge * random.unit()).sum();
                 probe(random.direction() * 5.0, corner + inside)
@@ -580,9 +598,13 @@ fn a_sheared_box_is_met_where_the_oracle_meets_it_within_its_condition() {
     };
     let worst = (0..runs).into_par_iter().map(worst_of_run);
     let (worst, across) = worst.reduce(|| (0.0, 0.0), |a, b| (a.0.max(b.0), a.1.max(b.1)));
-    eprintln!(
-        "{} rays: t is right within {worst:.2} ulp a condition, {across:.1} ulp across the face",
-        rays(100_000)
+    tell(
+        41,
+        "sheared boxes of a condition up to 1e8 are met at the oracle's t",
+        format!(
+            "{} rays, within {worst:.2} ulp a condition, {across:.1} ulp across the face",
+            few_rays(100_000)
+        ),
     );
     assert!(worst < 8.0 && across < 8.0);
 }
@@ -614,7 +636,7 @@ fn a_ray_in_the_plane_of_a_face_goes_in_and_out_or_neither() {
     let runs = 40;
     let [mut count, mut inside] = [0; 2];
     for seed in 0..runs as u64 {
-        let mut random = Random::new(seed);
+        let mut random = random(seed);
         let mut cuboid = || {
             let low = snapped(&mut random, true);
             (low, low + ((random.in_cube() + 1.25) * 4.0).ceil() / 4.0)
@@ -667,7 +689,11 @@ fn a_ray_in_the_plane_of_a_face_goes_in_and_out_or_neither() {
             assert!(is_close(&found, &truth), "{probe:?}: {found:?}, truly {truth:?}");
         }
     }
-    eprintln!("{count} rays in planes of faces: {inside} stretches inside, each with two ends");
+    tell(
+        43,
+        "a ray in the plane of a face goes in and out or neither",
+        format!("{count} rays, {inside} stretches inside"),
+    );
     assert!(inside > count / 10);
 }
 
@@ -744,13 +770,13 @@ fn add(sum: &mut [usize; 2], more: [usize; 2]) {
 fn a_die_with_round_corners_and_pips_is_met_where_the_oracle_meets_it() {
     let mut counts = [0; 2];
     for seed in 0..10 {
-        let mut random = Random::new(seed);
+        let mut random = random(seed);
         let turn = if seed == 0 { DMat3::IDENTITY } else { turn(&mut random) };
         let place = random.in_cube() * if seed % 2 == 0 { 0.0 } else { 3.0 };
         // Pips that touch nothing, or one another and the corners.
         let (corner, pip) = (random.between(1.35, 1.6), random.between(0.1, 0.3));
         let scene = read(&die(place, &turn, corner, pip));
-        let probes: Vec<Probe> = (0..rays(100_000) / 20)
+        let probes: Vec<Probe> = (0..few_rays(100_000) / 20)
             .map(|_| probe(place + random.direction() * 5.0, place + random.in_cube() * 1.1))
             .collect();
         add(&mut counts, compare_with_oracle(&scene, &probes, "a die"));
@@ -758,7 +784,7 @@ fn a_die_with_round_corners_and_pips_is_met_where_the_oracle_meets_it() {
     }
     let [same, close] = counts;
     eprintln!("a die: {same} answers are the oracle's, {close} too close to call");
-    assert!(same > rays(70_000) && close * 1000 < same);
+    assert!(same > few_rays(70_000) && close * 1000 < same);
 }
 
 #[test]
@@ -768,9 +794,9 @@ fn a_ray_that_starts_inside_solids_meets_what_the_oracle_meets() {
         for seed in 0..20 {
             let recipe = Recipe { solids: 3, parallelepipeds: 2, ..Recipe::new(style) };
             let scene = random_scene(seed, &recipe);
-            let mut random = Random::new(seed);
+            let mut random = random(seed);
             let middle = if style == Style::Far { FAR } else { DVec3::ZERO };
-            let probes: Vec<Probe> = (0..rays(100_000) / 60)
+            let probes: Vec<Probe> = (0..few_rays(100_000) / 60)
                 .map(|k| {
                     let origin = middle + snapped(&mut random, style == Style::Grid && k % 2 == 0);
                     Probe { origin, direction: random.direction(), leaving: None }

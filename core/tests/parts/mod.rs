@@ -1,14 +1,8 @@
 //! Geometry as scene text.
 
-use std::{env, fmt::Write};
+use std::fmt::Write;
 
 use glam::DVec3;
-
-/// `RTFARM_RAYS=100` makes the tests that count rays take a hundred times as many.
-pub(crate) fn rays(count: usize) -> usize {
-    let times = env::var("RTFARM_RAYS").map_or(1, |times| times.parse().expect("a number"));
-    count * times
-}
 
 /// What stands in a scene file for a point.
 fn words(point: DVec3) -> String {
