@@ -22,7 +22,7 @@ fn a_report_has_a_table_for_each_scene_and_a_plot() {
     let output = report(folder.path(), &["--out", "report"]);
     assert!(output.status.success(), "{output:?}");
     let text = fs::read_to_string(folder.path().join("report/report.md")).unwrap();
-    for scene in ["spheres", "polygons", "shadow", "lamp"] {
+    for scene in ["spheres", "polygons", "shadow", "lamp", "ball"] {
         let table = text.split(&format!("## {scene}, 24x18\n")).nth(1).expect(scene);
         let rows = table.lines().skip_while(|line| !line.starts_with("| `"));
         assert_eq!(rows.take_while(|line| line.starts_with("| `")).count(), 6, "{scene}: {table}");

@@ -9,7 +9,9 @@ use rtfarm_core::{
 };
 
 use crate::{
-    closed_forms::{irradiance, polygon_coverage, polygon_outline, sphere_outline},
+    closed_forms::{
+        irradiance, patch_to_sphere, polygon_coverage, polygon_outline, sphere_outline,
+    },
     picture::{eye_direction, grid_positions},
 };
 
@@ -29,13 +31,14 @@ pub struct KnownPicture {
 /// A screen of 4 x 3 at z = 0, seen from z = 5 and a little aside.
 const VIEWPORT: &str = "viewport origin 0.3 -0.2 5 topleft -2 1.5 0 bottomleft -2 -1.5 0
     topright 2 1.5 0 endviewport
-materials entry name white endentry endmaterials\n";
+materials entry name white endentry
+    entry name bright reflect 0.9 endentry endmaterials\n";
 
 /// All of them, `width` pixels wide and three quarters as high: outlines of spheres, outlines of
-/// polygons, a hard shadow, the light of a lamp.
+/// polygons, a hard shadow, the light of a lamp, the light that a ball out of sight sends on.
 pub fn known_pictures(width: u32) -> Vec<KnownPicture> {
     let size = Size::new(width.into(), u64::from(width) * 3 / 4).expect("a small size");
-    vec![spheres(size), polygons(size), shadow(size), lamp(size)]
+    vec![spheres(size), polygons(size), shadow(size), lamp(size), ball(size)]
 }
 
 fn known(
@@ -121,6 +124,28 @@ fn lamp(size: Size) -> KnownPicture {
         let light =
             |&(sx, sy): &(f64, f64)| lamp_at(scene, size, f64::from(x) + sx, f64::from(y) + sy);
         positions.iter().map(light).sum::<f64>() / positions.len() as f64
+    })
+}
+
+/// Under ambient light alone a ball sends on the same everywhere.
+fn ball(size: Size) -> KnownPicture {
+    let text = "lights ambient 0.5 endlights
+        geometry quadrangle vertex -9 -9 -1 vertex 9 -9 -1 vertex 9 9 -1 vertex -9 9 -1
+            material white endquadrangle
+            sphere coords -4.2 0.3 0.6 radius 1.5 material bright endsphere endgeometry";
+    known("ball", size, text, move |scene, x, y| {
+        let (viewport, ball, ambient) = (viewport(scene), scene.spheres[0], 0.5);
+        let reflect = scene.materials[ball.material as usize].reflect;
+        let received = |&(sx, sy): &(f64, f64)| {
+            let direction = eye_direction(&viewport, size, f64::from(x) + sx, f64::from(y) + sy);
+            let point = viewport.eye + direction * ((-1.0 - viewport.eye.z) / direction.z);
+            let to_ball = ball.center - point;
+            let distance = to_ball.length();
+            let share = patch_to_sphere(distance / ball.radius, to_ball.z / distance);
+            ambient + reflect * ambient * share
+        };
+        let positions = grid_positions(8);
+        positions.iter().map(received).sum::<f64>() / positions.len() as f64
     })
 }
 
