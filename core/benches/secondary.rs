@@ -2,11 +2,15 @@
 //! against rays spread over the whole sky by the same kernel; and how far off single pixels are.
 //!
 //!     cargo bench -p rtfarm-core --bench secondary
+//!
+//! With a scene and a way it renders that once, for those who count instructions:
+//!
+//!     valgrind --tool=callgrind target/release/deps/secondary-* room aimed
 
 #![expect(clippy::print_stdout, reason = "a benchmark prints its figures")]
 #![expect(clippy::disallowed_methods, reason = "a benchmark reads the clock")]
 
-use std::{fs, ops::ControlFlow, path::Path, time::Instant};
+use std::{env, fs, ops::ControlFlow, path::Path, time::Instant};
 
 use rtfarm_core::{
     isa::Isa,
@@ -24,6 +28,14 @@ const REFERENCE_SAMPLES: u32 = 1024;
 type Block = PreparedScene<PreparedBytes>;
 
 fn main() {
+    let arguments: Vec<String> = env::args().skip(1).collect();
+    if let [name, way] = arguments.as_slice() {
+        let ways = ways(name);
+        let (_, scene) = ways.iter().find(|(known, _)| known == way).expect("`spread` or `aimed`");
+        let picture = picture(scene, SAMPLES / 8, 0, true);
+        println!("{name} {way}: {} rays", picture.tally.rays);
+        return;
+    }
     println!(
         "secondary light alone, {SAMPLES} samples a pixel, one thread, medians of {ROUNDS}, \
          truth by {REFERENCE_SAMPLES} samples; errors in steps of 8 bits"
@@ -33,16 +45,21 @@ fn main() {
     }
 }
 
-fn measure(name: &str) {
+/// A scene, prepared in two ways.
+fn ways(name: &str) -> [(&'static str, Block); 2] {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../scenes").join(name);
     let text = fs::read(path.with_extension("rt")).expect("the project's own scene");
     let nothing = |_: &str| Err(std::io::ErrorKind::NotFound.into());
     let scene = read_scene(&text, &nothing).scene.expect("a scene without a fault");
     let open = |bytes| PreparedScene::open(bytes).expect("a valid block");
-    let ways = [
+    [
         ("spread", open(prepare_unaimed(&scene).expect("a scene"))),
         ("aimed", open(prepare(&scene).expect("a scene"))),
-    ];
+    ]
+}
+
+fn measure(name: &str) {
+    let ways = ways(name);
     let truth = secondary_light(&ways[1].1, REFERENCE_SAMPLES, 1000).0;
     // In turns, so that the machine's moods strike both alike.
     let mut seconds = [Vec::new(), Vec::new()];
@@ -83,16 +100,10 @@ fn measure(name: &str) {
 /// What secondary light adds to each channel, the seconds that the whole picture took and its
 /// rays.
 fn secondary_light(scene: &Block, samples: u32, seed: u64) -> (Vec<f64>, f64, u64) {
-    let size = Size::new(96, 54).expect("a size");
-    let picture = |secondary| {
-        let quality =
-            Quality { sampling: Sampling::Fixed(samples), seed, secondary, ..Quality::default() };
-        render(scene, &Settings { size, quality })
-    };
     let start = Instant::now();
-    let with = picture(true);
+    let with = picture(scene, samples, seed, true);
     let time = start.elapsed().as_secs_f64();
-    let without = picture(false);
+    let without = picture(scene, samples, seed, false);
     let difference = with
         .pixels
         .as_flattened()
@@ -103,9 +114,12 @@ fn secondary_light(scene: &Block, samples: u32, seed: u64) -> (Vec<f64>, f64, u6
     (difference, time, with.tally.rays)
 }
 
-fn render(scene: &Block, settings: &Settings) -> RenderedTile {
-    let size = settings.size;
+fn picture(scene: &Block, samples: u32, seed: u64, secondary: bool) -> RenderedTile {
+    let size = Size::new(96, 54).expect("a size");
+    let quality =
+        Quality { sampling: Sampling::Fixed(samples), seed, secondary, ..Quality::default() };
     let area = Area { x0: 0, y0: 0, width: size.width(), height: size.height() };
     let on_progress = &mut || ControlFlow::Continue(());
-    render_tile(scene, settings, area, Isa::fastest(), on_progress).expect("nobody stops it")
+    let settings = Settings { size, quality };
+    render_tile(scene, &settings, area, Isa::fastest(), on_progress).expect("nobody stops it")
 }

@@ -102,7 +102,7 @@ pub(crate) fn aim(view: &View<'_>, receiver: &Receiver, numbers: [f64; 3]) -> Op
 
 /// The probability density, in the measure of the cosine over π, with which [`aim`] chooses
 /// `direction` for what the emitter gives; it was met at `distance`, and the whole sky is sampled
-/// with probability `sky`. A face that is no emitter on record is never aimed at.
+/// with probability `sky`, below 1. A face that is no emitter on record is never aimed at.
 pub(crate) fn density(
     view: &View<'_>,
     receiver: &Receiver,
@@ -111,9 +111,6 @@ pub(crate) fn density(
     direction: DVec3,
     distance: f64,
 ) -> f64 {
-    if sky >= 1.0 {
-        return 1.0;
-    }
     let Some(index) = index else { return sky };
     let probability = Survey::new(view, receiver).probability(view, receiver, index);
     if probability == 0.0 {
@@ -139,7 +136,7 @@ fn relative_density(
         }
     } else {
         // Per solid angle distance² / (area · cosine there), over cosine / π.
-        PI * (distance * distance) / DVec3::from_array(emitter.place).dot(direction).abs()
+        PI * (distance * distance) / DVec3::from_array(emitter.turned_area).dot(direction).abs()
     };
     density / cosine
 }
@@ -164,7 +161,7 @@ struct Cone {
 
 /// `None` for a receiver inside, or so near that the cone is a hemisphere within rounding.
 fn cone(emitter: &EmitterRecord, receiver: &Receiver) -> Option<Cone> {
-    let to_center = DVec3::from_array(emitter.place) - receiver.position;
+    let to_center = DVec3::from_array(emitter.middle) - receiver.position;
     let (distance, radius) = (to_center.length(), emitter.size);
     let gap = distance - radius;
     if gap <= distance * SPHERE_CONTACT {
@@ -227,7 +224,7 @@ pub(crate) fn promise(view: &View<'_>, emitter: &EmitterRecord, receiver: &Recei
         return polygon_promise(view, emitter, receiver);
     }
     let [radiosity, _] = emitter.radiosity;
-    let to_center = DVec3::from_array(emitter.place) - receiver.position;
+    let to_center = DVec3::from_array(emitter.middle) - receiver.position;
     let distance = to_center.length();
     if distance - emitter.size <= distance * SPHERE_CONTACT {
         // All around, if it is there.
@@ -236,6 +233,24 @@ pub(crate) fn promise(view: &View<'_>, emitter: &EmitterRecord, receiver: &Recei
     let cosine = receiver.normal.dot(to_center) / distance;
     let share = sphere_share(cosine, emitter.size / distance);
     Promise { share, light: share * radiosity, square: 0.0 }
+}
+
+/// About the share of the sky that an emitter covers, in few steps: of a polygon the receiver's
+/// horizon is not looked at.
+pub(crate) fn rough_share(emitter: &EmitterRecord, receiver: &Receiver) -> f64 {
+    let to_middle = DVec3::from_array(emitter.middle) - receiver.position;
+    let squared = to_middle.length_squared();
+    let distance = squared.sqrt();
+    if emitter.is_sphere() {
+        if distance - emitter.size <= distance * SPHERE_CONTACT {
+            return 1.0;
+        }
+        let cosine = receiver.normal.dot(to_middle) / distance;
+        return sphere_share(cosine, emitter.size / distance);
+    }
+    let toward = DVec3::from_array(emitter.turned_area).dot(to_middle);
+    // `min` makes a number of 0/0.
+    (toward.abs() / ((emitter.size + PI * squared) * distance)).min(1.0)
 }
 
 /// About the share of the sky that a sphere covers whose centre is seen under an angle of this
@@ -248,16 +263,12 @@ pub(crate) fn sphere_share(cosine: f64, sine: f64) -> f64 {
     0.25 * sine * (above * above)
 }
 
-/// What a polygon promises. A near one, compared with its size, that covers much is left to the whole sky: its
-/// places are chosen by area, and of those next to the receiver that chooses too few.
+/// What a polygon promises. A near one, compared with its size, that covers much is left to the
+/// whole sky: its places are chosen by area, and of those next to the receiver that chooses too few.
 fn polygon_promise(view: &View<'_>, emitter: &EmitterRecord, receiver: &Receiver) -> Promise {
-    let turned_area = DVec3::from_array(emitter.place);
-    let all = corners(view, emitter).map(|corner| corner - receiver.position);
-    let corners = if emitter.is_triangle() { &all[..3] } else { &all[..] };
-    let toward = turned_area.dot(all[0]);
+    let middle = DVec3::from_array(emitter.middle) - receiver.position;
+    let toward = DVec3::from_array(emitter.turned_area).dot(middle);
     let radiosity = emitter.radiosity[usize::from(toward > 0.0)];
-    let part = emitter.size / corners.len() as f64;
-    let middle = corners.iter().sum::<DVec3>() / corners.len() as f64;
     let squared = middle.length_squared();
     // The share of the sky that a disc of its area covers at the best angle: 0..=1.
     let nearness = emitter.size / (emitter.size + PI * squared);
@@ -266,6 +277,9 @@ fn polygon_promise(view: &View<'_>, emitter: &EmitterRecord, receiver: &Receiver
     let mut share = nearness * toward.abs() / (emitter.size * squared.sqrt());
     if is_far > 0.0 || share < 2.0 * SMALL {
         // A part at each corner, as a disc.
+        let all = corners(view, emitter).map(|corner| corner - receiver.position);
+        let corners = if emitter.is_triangle() { &all[..3] } else { &all[..] };
+        let part = emitter.size / corners.len() as f64;
         let mut sum = 0.0;
         for &corner in corners {
             let place = 0.5 * (middle + corner);

@@ -75,14 +75,15 @@ impl<'a> Emitters<'a> {
         let reach = |&corner: &DVec3| (corner - middle).length();
         let radius = outline.iter().map(reach).fold(0.0, f64::max);
         let record = EmitterRecord {
-            place: turned_area.to_array(),
+            middle: middle.to_array(),
+            turned_area: turned_area.to_array(),
             size: area,
             radiosity: received.map(|light| self.radiosity(material, light)),
             vertices,
             rank,
             shape: if is_triangle { EmitterRecord::TRIANGLE } else { EmitterRecord::QUADRANGLE },
             node: NO_NODE,
-            padding: 0,
+            by_size: 0,
         };
         self.found.push((record, Twig { center: middle, radius, area }));
     }
@@ -113,14 +114,15 @@ impl<'a> Emitters<'a> {
             }
         }
         let record = EmitterRecord {
-            place: center.to_array(),
+            middle: center.to_array(),
+            turned_area: [0.0; 3],
             size: radius,
             radiosity: [self.radiosity(material, received); 2],
             vertices: [0; 4],
             rank,
             shape: EmitterRecord::SPHERE,
             node: NO_NODE,
-            padding: 0,
+            by_size: 0,
         };
         let area = 4.0 * std::f64::consts::PI * (radius * radius);
         self.found.push((record, Twig { center, radius, area }));
@@ -130,6 +132,11 @@ impl<'a> Emitters<'a> {
     pub(crate) fn finish(mut self) -> (Vec<EmitterRecord>, Vec<EmitterNode>) {
         self.found.sort_unstable_by_key(|(record, _)| record.rank);
         let (mut emitters, twigs): (Vec<_>, Vec<_>) = self.found.into_iter().unzip();
+        let mut by_size: Vec<u32> = (0..emitters.len() as u32).collect();
+        by_size.sort_by(|&a, &b| twigs[b as usize].area.total_cmp(&twigs[a as usize].area));
+        for (emitter, by_size) in emitters.iter_mut().zip(by_size) {
+            emitter.by_size = by_size;
+        }
         let nodes = build_tree(&mut emitters, &twigs);
         (emitters, nodes)
     }
@@ -158,10 +165,13 @@ pub(crate) fn smaller_ball(center: DVec3, radius: f64, (min, max): (DVec3, DVec3
     }
 }
 
-/// The part of a parallelogram, cut along its sides, that holds what lies within `bounds`; all of
-/// it where nothing does.
-pub(crate) fn within(corners: &[DVec3], (min, max): (DVec3, DVec3)) -> [DVec3; 4] {
+/// The part of a parallelogram, cut along its sides, that holds what lies within `bounds`; `None`
+/// where nothing does.
+pub(crate) fn within(corners: &[DVec3], (min, max): (DVec3, DVec3)) -> Option<[DVec3; 4]> {
     let (start, right, up) = (corners[0], corners[1] - corners[0], corners[3] - corners[0]);
+    // What lies on a bound is within it, whatever the rounding.
+    let slack = 1e-9 * max.abs().max(min.abs()).max_element();
+    let (min, max) = (min - slack, max + slack);
     // Places as shares of the two sides.
     let mut outline = vec![DVec2::ZERO, DVec2::X, DVec2::ONE, DVec2::Y];
     for axis in 0..3 {
@@ -174,9 +184,10 @@ pub(crate) fn within(corners: &[DVec3], (min, max): (DVec3, DVec3)) -> [DVec3; 4
     let none = (DVec2::ONE, DVec2::ZERO);
     let (low, high) = outline.iter().fold(none, |(low, high), &at| (low.min(at), high.max(at)));
     let (low, high) = ((low - 1e-9).max(DVec2::ZERO), (high + 1e-9).min(DVec2::ONE));
-    let (low, high) = if low.cmplt(high).all() { (low, high) } else { (DVec2::ZERO, DVec2::ONE) };
-    [(low.x, low.y), (high.x, low.y), (high.x, high.y), (low.x, high.y)]
-        .map(|(x, y)| start + x * right + y * up)
+    low.cmplt(high).all().then(|| {
+        [(low.x, low.y), (high.x, low.y), (high.x, high.y), (low.x, high.y)]
+            .map(|(x, y)| start + x * right + y * up)
+    })
 }
 
 /// The part of a convex outline where `height` is not below 0.

@@ -95,13 +95,16 @@ impl Gatherer {
         let surface = trace::surface(view, hit.item, hit.part);
         let material = &view.materials[trace::material(view, hit.item, hit.part) as usize];
         if material.emits() {
-            let index = view.emitter_of(hit.rank);
-            let density = match seeker.aim.emitter {
+            let Seeker { receiver, aim, .. } = &seeker;
+            let density = match aim.emitter {
+                None if aim.sky >= 1.0 => 1.0,
                 None => {
-                    let Seeker { receiver, aim, .. } = &seeker;
+                    let index = view.emitter_of(hit.rank);
                     emitter::density(view, receiver, aim.sky, index, ray.direction, distance)
                 }
-                Some((wanted, density)) if Some(wanted) == index => density,
+                Some((wanted, density)) if view.emitters[wanted as usize].rank == hit.rank => {
+                    density
+                }
                 Some(_) => f64::INFINITY,
             };
             let weight = seeker.share * (material.reflect * material.alpha) / density;

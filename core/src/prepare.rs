@@ -767,8 +767,9 @@ impl Faces {
                     if !found.is_one(leaf.material) {
                         continue;
                     }
+                    // The solid has nothing of the others.
+                    let Some(corners) = within(corners, bounds) else { continue };
                     let first = sorted.vertices.len() as u32;
-                    let corners = within(corners, bounds);
                     sorted.vertices.extend(corners.iter().map(DVec3::to_array));
                     let vertices = [first, first + 1, first + 2, first + 3];
                     found.add_polygon((leaf.material, rank), &vertices, &sorted.vertices);

@@ -24,7 +24,7 @@ use crate::{
 const MAGIC: [u8; 8] = *b"rtfarm\r\n";
 
 /// Changes with the layout or the meaning of any byte.
-const VERSION: u32 = 4;
+const VERSION: u32 = 5;
 
 /// Reads differently on a machine of the other byte order.
 const BYTE_ORDER: u32 = 0x0102_0304;
@@ -356,12 +356,14 @@ impl LightRecord {
 #[derive(Debug, Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
 #[repr(C)]
 pub(crate) struct EmitterRecord {
-    /// Of a sphere its centre, of a polygon its normal times its area.
-    pub(crate) place: [f64; 3],
+    /// The centre of a sphere, the mean of a polygon's corners.
+    pub(crate) middle: [f64; 3],
+    /// Of a polygon: its normal times its area.
+    pub(crate) turned_area: [f64; 3],
     /// The radius, or the area. Above 0.
     pub(crate) size: f64,
     /// About what each side sends on at most, in its brightest channel; of a polygon the side that
-    /// `place` leads to first.
+    /// `turned_area` leads to first.
     pub(crate) radiosity: [f64; 2],
     /// Of a polygon: the diagonal from the first to the third lies inside; the third of a triangle
     /// stands there twice.
@@ -370,7 +372,9 @@ pub(crate) struct EmitterRecord {
     pub(crate) shape: u32,
     /// Its leaf in the tree.
     pub(crate) node: u32,
-    pub(crate) padding: u32,
+    /// Of the record that stands at the same place in the order of sizes, the largest first: its
+    /// index.
+    pub(crate) by_size: u32,
 }
 
 impl EmitterRecord {
@@ -831,8 +835,10 @@ fn check_emitters(view: &View<'_>) -> Result<(), &'static str> {
         emitter.vertices.iter().all(|&k| (k as usize) < view.vertices.len()) || emitter.is_sphere()
     };
     for emitter in view.emitters {
-        let is_shape = finite(&emitter.place) && finite(&[emitter.size]) && emitter.size > 0.0;
+        let is_place = finite(&emitter.middle) && finite(&emitter.turned_area);
+        let is_shape = is_place && finite(&[emitter.size]) && emitter.size > 0.0;
         let is_known = emitter.shape <= EmitterRecord::SPHERE && vertices(emitter);
+        ensure((emitter.by_size as usize) < view.emitters.len(), "an emitter")?;
         let is_light = emitter.radiosity.iter().all(|&x| (0.0..=1e100).contains(&x));
         ensure(is_shape && is_known && is_light, "an emitter")?;
     }

@@ -1,4 +1,5 @@
-//! Light that faces send on to others, against closed forms. Every test prints how far off it is.
+//! Light that faces send on to others, against closed forms and the oracle's sums over the sky.
+//! Every test prints how far off it is.
 
 mod parts;
 #[expect(dead_code, reason = "other tests need the rest")]
@@ -8,17 +9,21 @@ use std::{fmt::Write, ops::ControlFlow};
 
 use glam::DVec3;
 use parts::{join, sphere, upright};
+use rayon::prelude::*;
 use rtfarm_core::{
     isa::Isa,
     render::{Quality, RenderedTile, Sampling, Settings, render_tile},
-    scene::Scene,
+    scene::{Scene, Texture},
     tile::{Area, Size},
 };
 use rtfarm_oracle::{
+    Oracle, Settings as OracleSettings,
     closed_forms::{
         integrating_sphere_bounce, one_bounce_from_disc, patch_to_polygon, patch_to_sphere,
     },
+    eye_direction,
     random::Random,
+    reference_picture,
 };
 use studio::{prepared, read, whole};
 
@@ -339,6 +344,177 @@ fn what_a_pane_lets_through_is_what_arrives() {
     let factor = patch_to_polygon(DVec3::ZERO, DVec3::Z, &pane).abs();
     let found = gathered(materials, "ambient 1", &geometry, place, 1.0);
     check("a pane that sends on", found, factor * (0.25 + 0.25 * 0.4), 0.03);
+}
+
+/// A few of everything over a floor, under two lamps: what is red, green or blue sends on, and so
+/// does a pane that lets light through.
+fn medley(seed: u64) -> Scene {
+    let mut random = Random::new(seed);
+    let mut near = |place: DVec3| place + 0.4 * random.in_cube();
+    let floor =
+        [(-9.0, -9.0), (9.0, -9.0), (9.0, 9.0), (-9.0, 9.0)].map(|(x, y)| DVec3::new(x, y, 0.0));
+    let mut geometry = polygon(&floor, "matte");
+    geometry += &sphere(near(DVec3::new(-2.2, -1.0, 1.2)), 0.7, "red");
+    geometry += &sphere(near(DVec3::new(2.0, 0.5, 2.2)), 0.4, "green");
+    let corners = [(-0.5, -3.0, 0.5), (1.5, -2.5, 0.6), (0.6, -2.0, 2.0)];
+    let triangle = corners.map(|(x, y, z)| near(DVec3::new(x, y, z)));
+    geometry += &polygon(&triangle, "blue");
+    let (corner, right) = (near(DVec3::new(-4.0, 2.0, 0.5)), DVec3::new(3.5, 1.0, 0.3));
+    let up = DVec3::new(0.2, 0.4, 2.5);
+    let wall = [corner, corner + right, corner + right + 0.7 * up, corner + up];
+    geometry += &polygon(&wall, "green");
+    let low = near(DVec3::new(1.2, -1.4, 0.5));
+    let bite = near(low + DVec3::new(0.2, 0.0, 1.0));
+    geometry += &join(
+        "difference",
+        &[&upright(low, low + DVec3::new(1.2, 1.0, 1.1), "blue"), &sphere(bite, 0.6, "red")],
+    );
+    let corner = near(DVec3::new(-3.2, -2.2, 0.5));
+    let (right, up) = (DVec3::new(2.0, -0.4, 0.1), DVec3::new(0.1, 0.5, 1.9));
+    geometry += &polygon(&[corner, corner + right, corner + right + up, corner + up], "pane");
+    read(&format!(
+        "viewport origin 0 -9 3 topleft -1.6 -6 3 bottomleft -1.6 -6 1.2 topright 1.6 -6 3
+            background 20 30 40 endviewport
+        materials entry name matte color 200 210 190 endentry
+            entry name red color 255 40 20 reflect 0.3 endentry
+            entry name green color 60 220 50 reflect 0.15 alpha 0.8 endentry
+            entry name blue color 30 60 255 reflect 0.2 endentry
+            entry name pane color 250 240 160 reflect 0.2 alpha 0.3 endentry endmaterials
+        lights ambient 0.2 reference power 1 distance 4 endreference
+            point coords 2 -4 4 power 2 endpoint
+            point coords -3 -3.5 3 power 1.5 endpoint endlights
+        geometry {geometry} endgeometry"
+    ))
+}
+
+/// Settings under which a pixel's one sample is its middle, and nothing is seen in mirrors of
+/// mirrors.
+fn middles(size: Size, seed: u64, secondary: bool) -> Settings {
+    let sampling = Sampling::Fixed(1);
+    let quality = Quality { sampling, seed, secondary, cutoff: 0.1, ..Quality::default() };
+    Settings { size, quality }
+}
+
+fn oracle_settings(secondary: Option<u32>) -> OracleSettings {
+    OracleSettings { cutoff: 0.1, secondary, ..OracleSettings::default() }
+}
+
+/// The mean of a picture over many seeds is what the oracle sums, within 4 sigma and the error of
+/// that sum, which a coarser one tells. Both are small shares of the light that is sent on.
+fn check_against_oracle(what: &str, scene: &Scene, size: Size, side: u32, seeds: u64) {
+    let block = prepared(scene);
+    let pictures: Vec<Vec<[f32; 3]>> = (0..seeds)
+        .into_par_iter()
+        .map(|seed| {
+            let go_on = &mut || ControlFlow::Continue(());
+            let settings = middles(size, seed, true);
+            render_tile(&block, &settings, whole(size), Isa::fastest(), go_on).unwrap().pixels
+        })
+        .collect();
+    let middle = |_, _| vec![(0.5, 0.5)];
+    let summed = |secondary| {
+        let settings = oracle_settings(secondary);
+        reference_picture(scene, size, &middle, &settings).into_flattened()
+    };
+    let (none, coarse, fine) = (summed(None), summed(Some(side / 2)), summed(Some(side)));
+    let differences = fine.iter().zip(&coarse).map(|(fine, coarse)| (fine - coarse).abs());
+    // One place's two sums may agree by chance.
+    let blur = differences.fold(0.0, f64::max);
+    let (mut brightest, mut worst, mut noise) = (0.0_f64, 0.0_f64, 0.0_f64);
+    for (k, truth) in fine.iter().enumerate() {
+        let values: Vec<f64> =
+            pictures.iter().map(|pixels| f64::from(pixels.as_flattened()[k])).collect();
+        let (mean, error) = mean_and_error(&values);
+        let off = (mean - truth).abs();
+        let rounding = f64::from(f32::EPSILON) * truth;
+        let what = format!("{what}, pixel {}, channel {}", k / 3, k % 3);
+        assert!(
+            off <= 4.0 * error + blur + rounding,
+            "{what}: {mean} ± {error}, truly {truth} ± {blur}, and {} without",
+            none[k]
+        );
+        brightest = brightest.max(truth - none[k]);
+        worst = worst.max(off);
+        noise = noise.max(error);
+    }
+    // All of it together, where noise is least.
+    let total = |values: &[f64]| values.iter().sum::<f64>();
+    let total_seen =
+        |pixels: &Vec<[f32; 3]>| pixels.as_flattened().iter().map(|x| f64::from(*x)).sum();
+    let (mean, error) = mean_and_error(&pictures.iter().map(total_seen).collect::<Vec<f64>>());
+    let (off, blur_of_all) = (mean - total(&fine), (total(&fine) - total(&coarse)).abs());
+    let gathered = total(&fine) - total(&none);
+    eprintln!(
+        "{what}: secondary light up to {brightest:.2e}; off by up to {worst:.1e}, noise up to \
+         {noise:.1e}, the sum's error about {blur:.1e}; in all off by {:+.2} %, noise {:.2} %, the \
+         sum's error {:.2} %",
+        100.0 * off / gathered,
+        100.0 * error / gathered,
+        100.0 * blur_of_all / gathered
+    );
+    assert!(off.abs() <= 4.0 * error + blur_of_all + 1e-6, "{what}: {mean} ± {error}");
+    assert!(brightest > 0.01 && noise < 0.025 * brightest && blur < 0.02 * brightest, "{what}");
+    assert!(error < 0.01 * gathered && blur_of_all < 0.01 * gathered, "{what}");
+}
+
+#[test]
+fn the_mean_of_many_seeds_is_what_the_oracle_sums_over_the_sky() {
+    for seed in [1, 2] {
+        let size = Size::new(4, 3).unwrap();
+        check_against_oracle(&format!("medley {seed}"), &medley(seed), size, 192, 30_000);
+    }
+}
+
+#[test]
+fn a_face_with_a_texture_sends_on_its_finest_colours() {
+    // Stripes and spots that any coarser level would blend.
+    let mut random = Random::new(3);
+    let texels = (0..64).map(|k| {
+        let bright = if k / 8 % 2 == 0 { 255 } else { 0 };
+        [bright, random.below(256) as u8, 255 - bright]
+    });
+    let texture = Texture { path: String::new(), width: 8, height: 8, texels: texels.collect() };
+    let square = |corners: [(f64, f64, f64); 4], material| {
+        polygon(&corners.map(|(x, y, z)| DVec3::new(x, y, z)), material)
+    };
+    let mut scene = read(&format!(
+        "viewport origin 0 -3 2 topleft -0.3 -1.5 0.9 bottomleft -0.3 -1.5 0.3
+            topright 0.3 -1.5 0.9 endviewport
+        materials entry name matte endentry entry name worn reflect 0.5 endentry endmaterials
+        lights ambient 0.3 reference power 1 distance 2 endreference
+            point coords 1 -1 1.5 power 1 endpoint endlights
+        geometry {} {} {} endgeometry",
+        square([(-5.0, -5.0, 0.0), (5.0, -5.0, 0.0), (5.0, 5.0, 0.0), (-5.0, 5.0, 0.0)], "matte"),
+        square([(-1.0, 0.6, 0.1), (1.0, 0.4, 0.1), (0.8, 0.495, 1.0), (-1.0, 0.7, 1.3)], "worn"),
+        polygon(
+            &[DVec3::new(-0.9, -0.7, 0.1), DVec3::new(-1.0, 0.3, 0.1), DVec3::new(-1.2, 0.0, 0.8)],
+            "worn"
+        ),
+    ));
+    scene.textures.push(texture);
+    scene.materials[1].texture = Some(0);
+    check_against_oracle("worn", &scene, Size::new(3, 2).unwrap(), 192, 30_000);
+}
+
+#[test]
+fn without_it_the_picture_is_the_oracles_in_light_from_lamps_alone() {
+    let size = Size::new(32, 18).unwrap();
+    for seed in [1, 2, 3] {
+        let scene = medley(seed);
+        let found = rendered(&scene, &middles(size, 7, false), Isa::fastest()).pixels;
+        let middle = |_, _| vec![(0.5, 0.5)];
+        let truth = reference_picture(&scene, size, &middle, &oracle_settings(None));
+        let oracle = Oracle::new(&scene);
+        let viewport = scene.viewport.unwrap();
+        for (k, (found, truth)) in found.iter().zip(&truth).enumerate() {
+            let off = |(a, b): (&f32, &f64)| (f64::from(*a) - b).abs();
+            let off = found.iter().zip(truth).map(off).fold(0.0, f64::max);
+            let at = |k: usize| k as f64 + 0.5;
+            let direction = eye_direction(&viewport, size, at(k % 32), at(k / 32));
+            let sees = oracle.first_hit(viewport.eye, direction, None).map(|hit| hit.id);
+            assert!(off < 1e-6, "medley {seed}, pixel {k}, {sees:?}: {found:?}, truly {truth:?}");
+        }
+    }
 }
 
 /// Balls, boxes, a solid, a mirror and glass over a floor, with a lamp; all colours shine.

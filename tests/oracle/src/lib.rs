@@ -23,6 +23,7 @@ mod solid;
 mod light;
 mod picture;
 mod radiance;
+mod secondary;
 mod texture;
 
 // What needs no rays.

@@ -16,11 +16,14 @@ pub struct Settings {
     pub flat: bool,
     /// A branch whose weight is below this is not traced.
     pub cutoff: f64,
+    /// Faces send light on to others, which is summed over this many times this many directions;
+    /// see [`Oracle::secondary_light`]. `None`: they do not.
+    pub secondary: Option<u32>,
 }
 
 impl Default for Settings {
     fn default() -> Self {
-        Self { flat: false, cutoff: 1.0 / 4096.0 }
+        Self { flat: false, cutoff: 1.0 / 4096.0, secondary: None }
     }
 }
 
@@ -94,6 +97,13 @@ impl Oracle {
         if settings.flat || self.scene.lights.is_empty() && self.scene.ambient.is_none() {
             return DVec3::ONE;
         }
+        let secondary = settings.secondary.map(|side| self.secondary_light(hit, side));
+        self.first_light(crossing, hit) + secondary.unwrap_or_default()
+    }
+
+    /// What arrives without being sent on by a face: the light from everywhere and straight from
+    /// the point lights.
+    pub(crate) fn first_light(&self, crossing: &Crossing<'_>, hit: &Hit) -> DVec3 {
         self.scene.ambient.unwrap_or(DVec3::ZERO) + self.direct_light(crossing, hit)
     }
 }

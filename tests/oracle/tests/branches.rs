@@ -47,7 +47,7 @@ fn scene(materials: Vec<Material>) -> Scene {
 }
 
 fn see_with(scene: &Scene, origin: DVec3, direction: DVec3, cutoff: f64) -> DVec3 {
-    Oracle::new(scene).radiance(origin, direction, &Settings { flat: false, cutoff })
+    Oracle::new(scene).radiance(origin, direction, &Settings { cutoff, ..Settings::default() })
 }
 
 #[track_caller]
