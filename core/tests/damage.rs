@@ -104,13 +104,13 @@ fn is_taken(block: &[u8], what: &str) -> bool {
 }
 
 /// Numbers that mean something else than what stood there.
-fn damages(was: &[u8; 8]) -> impl Iterator<Item = Vec<u8>> + use<> {
+fn damages(was: [u8; 8]) -> impl Iterator<Item = Vec<u8>> + use<> {
     let word = u32::from_le_bytes(was[..4].try_into().unwrap());
     let words = [0, 1, 2, 3, word.wrapping_add(1), word.wrapping_sub(1), word ^ 1 << 31]
         .into_iter()
         .chain([12, 100, 1 << 20, i32::MAX as u32, u32::MAX - 1, u32::MAX, 0x7FC0_0000])
         .map(|word: u32| word.to_le_bytes().to_vec());
-    let real = f64::from_le_bytes(*was);
+    let real = f64::from_le_bytes(was);
     let reals = [0.0, -0.0, 1.0, -real, real * 1e6, real * 1e-6, 1e99, -1e99, 1e100, 1e308, 1e-320]
         .into_iter()
         .chain([f64::INFINITY, f64::NEG_INFINITY, f64::NAN])
@@ -133,7 +133,7 @@ fn check_damaged_words(sections: std::ops::Range<usize>) {
                 let mut was = [0; 8];
                 let end = (at + 8).min(block.len());
                 was[..end - at].copy_from_slice(&block[at..end]);
-                damages(&was).map(move |damage| {
+                damages(was).map(move |damage| {
                     let mut damaged = block.to_vec();
                     let end = (at + damage.len()).min(damaged.len());
                     damaged[at..end].copy_from_slice(&damage[..end - at]);
