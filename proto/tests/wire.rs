@@ -16,7 +16,9 @@ fn corpus() -> Vec<Vec<u8>> {
 #[test]
 fn messages_hold() {
     assert!(!corpus().is_empty());
-    corpus().iter().for_each(|message| targets::message(message));
+    for message in corpus() {
+        targets::message(&message);
+    }
 }
 
 #[test]
