@@ -19,6 +19,15 @@ use crate::{
 /// Children that may wait while a ray visits others: seven on each level and the last node's.
 const STACK: usize = 7 * crate::bvh::MOST_LEVELS + 8;
 
+/// Room for them. A batch's rays share it: to fill it anew for each would cost as much as the ray.
+struct Stack([(f32, Child); STACK]);
+
+impl Default for Stack {
+    fn default() -> Self {
+        Self([(0.0, Child::NONE); STACK])
+    }
+}
+
 /// Finds what each ray meets first.
 pub(crate) fn trace(view: &View<'_>, isa: Isa, rays: &[Ray], hits: &mut Vec<Hit>) {
     hits.clear();
@@ -79,10 +88,10 @@ struct Trace<'a> {
 impl Batch for Trace<'_> {
     #[inline(always)]
     fn run<K: BoxKernel>(&mut self, view: &View<'_>) {
-        let mut scratch = Scratch::default();
+        let (mut scratch, mut stack) = (Scratch::default(), Stack::default());
         for ray in self.rays {
             let mut nearest = Nearest::new(ray);
-            visit::<K>(view, ray, |item| {
+            visit::<K>(view, ray, &mut stack, |item| {
                 nearest.meet(view, item, &mut scratch);
                 Step::On(nearest.hit.t)
             });
@@ -101,11 +110,11 @@ struct Shadows<'a> {
 impl Batch for Shadows<'_> {
     #[inline(always)]
     fn run<K: BoxKernel>(&mut self, view: &View<'_>) {
-        let mut scratch = Scratch::default();
+        let (mut scratch, mut stack) = (Scratch::default(), Stack::default());
         for ray in self.rays {
             let shear = Shear::new(ray.origin, ray.direction);
             let mut is_blocked = false;
-            visit::<K>(view, ray, |item| {
+            visit::<K>(view, ray, &mut stack, |item| {
                 between(view, ray, &shear, self.touches, item, &mut scratch, |_, _| {
                     is_blocked = true;
                 });
@@ -126,13 +135,13 @@ struct ClearShadows<'a> {
 impl Batch for ClearShadows<'_> {
     #[inline(always)]
     fn run<K: BoxKernel>(&mut self, view: &View<'_>) {
-        let mut scratch = Scratch::default();
+        let (mut scratch, mut stack) = (Scratch::default(), Stack::default());
         let mut crossed: Vec<(u32, f64)> = Vec::new();
         for ray in self.rays {
             let shear = Shear::new(ray.origin, ray.direction);
             crossed.clear();
             let mut is_blocked = false;
-            visit::<K>(view, ray, |item| {
+            visit::<K>(view, ray, &mut stack, |item| {
                 between(view, ray, &shear, self.touches, item, &mut scratch, |rank, part| {
                     let material = &view.materials[material(view, item, part) as usize];
                     let share = material.clearness();
@@ -159,8 +168,13 @@ enum Step {
 
 /// Calls `meet` for the faces in the leaves that the ray enters, nearer boxes first.
 #[inline(always)]
-fn visit<K: BoxKernel>(view: &View<'_>, ray: &Ray, meet: impl FnMut(Item) -> Step) {
-    visit_nodes::<K>(view, ray, || (), meet);
+fn visit<K: BoxKernel>(
+    view: &View<'_>,
+    ray: &Ray,
+    stack: &mut Stack,
+    meet: impl FnMut(Item) -> Step,
+) {
+    visit_nodes::<K>(view, ray, stack, || (), meet);
 }
 
 /// The same, and calls `enter` for each node.
@@ -168,11 +182,11 @@ fn visit<K: BoxKernel>(view: &View<'_>, ray: &Ray, meet: impl FnMut(Item) -> Ste
 fn visit_nodes<K: BoxKernel>(
     view: &View<'_>,
     ray: &Ray,
+    Stack(stack): &mut Stack,
     mut enter: impl FnMut(),
     mut meet: impl FnMut(Item) -> Step,
 ) {
     let mut box_ray = BoxRay::new(ray.origin, ray.direction, ray.reach, &view.header.frame);
-    let mut stack = [(0.0_f32, Child::NONE); STACK];
     let mut waiting = 0;
     let mut current = Child(0); // The root.
     loop {
@@ -443,6 +457,7 @@ impl<B: AsRef<[u8]>> PreparedScene<B> {
             visit_nodes::<ScalarBoxes>(
                 &view,
                 &ray,
+                &mut Stack::default(),
                 || visits += 1,
                 |item| {
                     nearest.meet(&view, item, &mut scratch);
@@ -462,7 +477,7 @@ impl<B: AsRef<[u8]>> PreparedScene<B> {
             let ray = to_ray(&view, probe);
             let shear = Shear::new(ray.origin, ray.direction);
             let mut crossings = 0;
-            visit::<ScalarBoxes>(&view, &ray, |item| {
+            visit::<ScalarBoxes>(&view, &ray, &mut Stack::default(), |item| {
                 between(&view, &ray, &shear, &[], item, &mut scratch, |_, _| crossings += 1);
                 Step::On(ray.reach)
             });

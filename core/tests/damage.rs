@@ -1,7 +1,6 @@
 //! Prepared scenes whose bytes nobody wrote, under a hash that fits: each is refused, or shows a
 //! picture of finite light; no damage leads to a panic or an endless walk.
 
-#[expect(dead_code, reason = "other tests need the rest")]
 mod parts;
 #[expect(dead_code, reason = "other tests need the rest")]
 mod studio;
