@@ -11,6 +11,7 @@ mod tables;
 use std::{
     fs,
     io::{self, Write},
+    os::unix::fs::PermissionsExt,
     path::Path,
 };
 
@@ -97,7 +98,10 @@ fn write(folder: &Path, text: &str, ladders: &[Ladder]) -> anyhow::Result<()> {
     fs::create_dir_all(folder).with_context(in_place)?;
     let text = format!("{text}\n![error against time]({})\n", plot::FILE);
     for (name, content) in [("report.md", text), (plot::FILE, plot::draw(ladders)?)] {
-        let file = tempfile::NamedTempFile::new_in(folder).with_context(in_place)?;
+        let file = tempfile::Builder::new()
+            .permissions(fs::Permissions::from_mode(0o666))
+            .tempfile_in(folder)
+            .with_context(in_place)?;
         fs::write(file.path(), content).with_context(in_place)?;
         file.persist(folder.join(name)).map_err(|error| error.error).with_context(in_place)?;
     }
