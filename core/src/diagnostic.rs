@@ -39,26 +39,6 @@ pub struct Diagnostic {
     pub related: Option<Related>,
 }
 
-impl Diagnostic {
-    /// A diagnostic about the word at a place of `text`.
-    pub fn at_place(severity: Severity, text: &[u8], at: Place, message: String) -> Self {
-        let lines = text.split_inclusive(|&byte| byte == b'\n');
-        let line_start: usize = lines.take(at.line as usize - 1).map(<[u8]>::len).sum();
-        let has_mark = line_start == 0 && text.starts_with(BYTE_ORDER_MARK);
-        let line_start = if has_mark { BYTE_ORDER_MARK.len() } else { line_start };
-        // A character begins with any byte but a continuation byte.
-        let begins = |&&byte: &&u8| byte & 0xC0 != 0x80;
-        let mut characters = 0;
-        let before = text[line_start..].iter().take_while(|byte| {
-            characters += u32::from(begins(byte));
-            characters < at.column
-        });
-        let start = line_start + before.count();
-        let length = text[start..].iter().take_while(|byte| !byte.is_ascii_whitespace()).count();
-        Self { severity, at, span: start..start + length, message, related: None }
-    }
-}
-
 /// A second place that explains a diagnostic.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Related {

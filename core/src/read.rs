@@ -16,8 +16,7 @@ use crate::{
     exact,
     lexer::Word,
     mesh_file::{self, MeshFile},
-    scene,
-    scene::{Light, Material, MaterialPlaces, MeshShape, Scene, SolidNode, Viewport},
+    scene::{Light, Material, MeshShape, Scene, SolidNode, Viewport},
     shapes::direction,
     symbol::Symbols,
     texture,
@@ -103,12 +102,10 @@ pub(crate) struct Reader<'t> {
     /// Power and distance of each `reference`.
     references: Vec<(f64, f64)>,
     lights: Vec<PointLight<'t>>,
-    /// Byte offsets of each material's alpha, reflect, refract and texture.
-    material_offsets: Vec<[Option<usize>; 4]>,
     /// The file name of each material's texture.
     texture_names: Vec<(u32, Word<'t>)>,
-    pub(crate) solid_offsets: Vec<usize>,
-    pub(crate) mesh_words: Vec<MeshWords<'t>>,
+    /// What each mesh's file is called.
+    pub(crate) mesh_files: Vec<Word<'t>>,
 }
 
 /// A point light before the reference that governs it is known.
@@ -119,12 +116,6 @@ struct PointLight<'t> {
     color: DVec3,
     /// How many references stand before it.
     references_before: usize,
-}
-
-/// Where a mesh begins and what its file is called.
-pub(crate) struct MeshWords<'t> {
-    pub(crate) opening: Word<'t>,
-    pub(crate) file: Word<'t>,
 }
 
 impl<'t> Reader<'t> {
@@ -147,10 +138,8 @@ impl<'t> Reader<'t> {
             ambient: Field::default(),
             references: Vec::new(),
             lights: Vec::new(),
-            material_offsets: Vec::new(),
             texture_names: Vec::new(),
-            solid_offsets: Vec::new(),
-            mesh_words: Vec::new(),
+            mesh_files: Vec::new(),
         }
     }
 
@@ -372,7 +361,6 @@ impl<'t> Reader<'t> {
         let entry = self.symbols.get_mut(symbol);
         entry.definition = Some((index, name));
         entry.is_textured = texture.value.is_some();
-        let alpha_word = alpha.word.or(refract.word.filter(|_| refract.value > Some(0.0)));
         self.scene.materials.push(Material {
             name: String::from_utf8_lossy(name.bytes).into_owned(),
             color: color.value.unwrap_or(DVec3::ONE),
@@ -380,13 +368,8 @@ impl<'t> Reader<'t> {
             reflect: reflect.value.unwrap_or(0.0),
             refract: refract.value.unwrap_or(0.0),
             texture: None,
-            places: MaterialPlaces::default(),
         });
         self.texture_names.extend(texture.value.map(|file| (index, file)));
-        self.material_offsets.push(
-            [alpha_word, reflect.word, refract.word, texture.word]
-                .map(|word| word.map(|word| word.start)),
-        );
     }
 
     fn clamp_color(&mut self, parts: [f64; 3]) -> DVec3 {
@@ -565,12 +548,8 @@ impl<'t> Reader<'t> {
         self.read_textures(resolve);
         self.read_meshes(resolve);
         let is_sound = self.blocks.report.is_free_of_errors();
-        let offsets = (self.material_offsets.iter().flatten().flatten().copied())
-            .chain(self.solid_offsets.iter().copied())
-            .chain(self.mesh_words.iter().map(|words| words.opening.start))
-            .filter(|_| is_sound);
-        let places = Places::new(self.text, offsets.chain(self.blocks.report.offsets()));
-        let scene = is_sound.then(|| self.place_scene(&places));
+        let places = Places::new(self.text, self.blocks.report.offsets());
+        let scene = is_sound.then(|| std::mem::take(&mut self.scene));
         let (diagnostics, omitted) = self.blocks.report.finish(&places);
         Reading { scene, diagnostics, omitted }
     }
@@ -692,8 +671,7 @@ impl<'t> Reader<'t> {
         let (scene, report) = (&mut self.scene, &mut self.blocks.report);
         let mut by_path: HashMap<&[u8], Option<Arc<MeshShape>>> = HashMap::new();
         let mut by_content: HashMap<blake3::Hash, Arc<MeshShape>> = HashMap::new();
-        for (mesh, words) in scene.meshes.iter_mut().zip(&self.mesh_words) {
-            let name = words.file;
+        for (mesh, name) in scene.meshes.iter_mut().zip(&self.mesh_files) {
             let shape = by_path.entry(name.bytes).or_insert_with(|| {
                 let path = String::from_utf8_lossy(name.bytes);
                 let mut read = || {
@@ -722,27 +700,7 @@ impl<'t> Reader<'t> {
             }
         }
     }
-
-    /// Fills in places and gives the scene away.
-    fn place_scene(&mut self, places: &Places) -> Scene {
-        let mut scene = std::mem::take(&mut self.scene);
-        for (material, offsets) in scene.materials.iter_mut().zip(&self.material_offsets) {
-            let [alpha, reflect, refract, texture] =
-                offsets.map(|offset| offset.map(|offset| places.place(offset)));
-            material.places = MaterialPlaces { alpha, reflect, refract, texture };
-        }
-        for (solid, &offset) in scene.solids.iter_mut().zip(&self.solid_offsets) {
-            solid.at = places.place(offset);
-        }
-        for (mesh, words) in scene.meshes.iter_mut().zip(&self.mesh_words) {
-            mesh.at = places.place(words.opening.start);
-        }
-        scene
-    }
 }
-
-/// Stands for places until they are known.
-pub(crate) const NOWHERE: scene::Place = scene::Place { line: 0, column: 0 };
 
 /// A keyword in a sentence.
 pub(crate) fn plain(word: Word<'_>) -> String {

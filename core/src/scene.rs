@@ -135,21 +135,6 @@ pub struct Material {
     pub refract: f64,
     /// The image that multiplies `color`: an index in [`Scene::textures`].
     pub texture: Option<u32>,
-    /// Where the file sets the fields that need more than the plain tracer.
-    pub places: MaterialPlaces,
-}
-
-/// Where a material's fields stand in the file; `None` where a default holds.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub struct MaterialPlaces {
-    /// Of `alpha`, or of `refract` where that implies an alpha of 0.
-    pub alpha: Option<Place>,
-    /// Of `reflect`.
-    pub reflect: Option<Place>,
-    /// Of `refract`.
-    pub refract: Option<Place>,
-    /// Of `texture`.
-    pub texture: Option<Place>,
 }
 
 /// An image on a surface.
@@ -222,8 +207,6 @@ pub struct Solid {
     pub nodes: Vec<SolidNode>,
     /// The place among all primitives of the file, from 0.
     pub primitive: u32,
-    /// Where it begins in the file.
-    pub at: Place,
 }
 
 /// A node of a constructive solid. The `primitive` of a leaf is its place within the solid.
@@ -271,8 +254,6 @@ pub struct Mesh {
     pub material: u32,
     /// The place among all primitives of the file, from 0.
     pub primitive: u32,
-    /// Where it begins in the file.
-    pub at: Place,
 }
 
 /// What a mesh file holds.

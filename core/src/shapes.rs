@@ -9,7 +9,7 @@ use crate::{
     diagnostic::shown,
     exact::{self, QuadrangleFault},
     lexer::Word,
-    read::{MeshWords, NOWHERE, Reader, plain},
+    read::{Reader, plain},
     scene::{
         Mesh, MeshShape, MeshVertices, Operation, Parallelepiped, Quadrangle, Solid, SolidNode,
         Sphere, Triangle,
@@ -120,8 +120,7 @@ impl<'t> Reader<'t> {
 
     fn finish_solid(&mut self, opening: Word<'t>, nodes: Vec<SolidNode>) {
         let primitive = self.next_primitive(opening);
-        self.solid_offsets.push(opening.start);
-        self.scene.solids.push(Solid { nodes, primitive, at: NOWHERE });
+        self.scene.solids.push(Solid { nodes, primitive });
     }
 
     /// The number of a primitive that begins at `word`.
@@ -394,7 +393,7 @@ impl<'t> Reader<'t> {
         let file = file.require(&mut self.blocks, opening, "file");
         let material = material.require(&mut self.blocks, opening, "material");
         if let (Some(file), Some(material)) = (file, material) {
-            self.mesh_words.push(MeshWords { opening, file });
+            self.mesh_files.push(file);
             self.scene.meshes.push(Mesh {
                 path: String::from_utf8_lossy(file.bytes).into_owned(),
                 shape: Arc::new(MeshShape {
@@ -406,7 +405,6 @@ impl<'t> Reader<'t> {
                 offset: offset.value.unwrap_or_default(),
                 material,
                 primitive,
-                at: NOWHERE,
             });
         }
     }

@@ -10,7 +10,7 @@ use rtfarm_core::{
     isa::Isa,
     prepare::prepare,
     prepared::{PreparedBytes, PreparedScene},
-    scene::{Operation, Parallelepiped, Place, Quadrangle, Scene, Solid, SolidNode, Triangle},
+    scene::{Operation, Parallelepiped, Quadrangle, Scene, Solid, SolidNode, Triangle},
     trace::Probe,
 };
 use rtfarm_oracle::{
@@ -125,7 +125,7 @@ fn shell((offset, scale): (f64, f64)) -> Surface {
         }
     }
     let mut scene = empty();
-    scene.solids.push(Solid { nodes, primitive: 0, at: Place { line: 1, column: 1 } });
+    scene.solids.push(Solid { nodes, primitive: 0 });
     Surface { scene, edges, inside: vec![offset, offset + 0.1 * scale], is_thick: true }
 }
 

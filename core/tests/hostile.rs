@@ -92,16 +92,6 @@ fn depth_takes_no_stack() {
 }
 
 #[test]
-fn a_line_of_many_materials_has_its_places_found_in_one_walk() {
-    let entries = (0..100_000)
-        .map(|k| format!("entry name m{k} alpha 1 endentry "))
-        .collect::<Vec<_>>()
-        .concat();
-    let scene = read(format!("materials {entries} endmaterials").as_bytes()).scene.unwrap();
-    assert!(scene.materials[99_999].places.alpha.unwrap().column > 3_000_000);
-}
-
-#[test]
 fn texts_in_other_encodings_are_named() {
     check_refused(b"\xff\xfeg\0e\0", "1:1", "this file is in UTF-16; save it as UTF-8");
     check_refused(b"\x1f\x8b\x08", "1:1", "this file is compressed by gzip; unpack it first");

@@ -5,7 +5,7 @@ use std::io;
 use glam::{DVec2, DVec3};
 use rtfarm_core::{
     read::{Reading, read_scene},
-    scene::{Dropped, Operation, Place, Scene, SolidNode},
+    scene::{Dropped, Operation, Scene, SolidNode},
     tile::Size,
 };
 
@@ -96,14 +96,12 @@ fn materials_have_the_documented_defaults() {
         (plain.color, plain.alpha, plain.reflect, plain.refract),
         (DVec3::ONE, 1.0, 0.0, 0.0)
     );
-    assert_eq!(plain.places.alpha, None);
     assert_eq!((glass.alpha, glass.refract), (0.0, 0.7));
-    assert_eq!(glass.places.alpha, Some(Place { line: 5, column: 2 }), "it follows from refract");
     assert_eq!(
         (both.color, both.alpha, both.reflect, both.refract),
         (DVec3::new(0.2, 0.4, 1.0), 0.25, 0.5, 2.0)
     );
-    assert_eq!((both.texture, both.places.texture), (Some(0), Some(Place { line: 6, column: 76 })));
+    assert_eq!(both.texture, Some(0));
     assert_eq!(scene.textures[0].texels, [[255, 0, 0], [0, 255, 0]]);
 }
 
@@ -224,7 +222,7 @@ fn operations_are_read_in_postfix_order() {
          endgeometry"
     ));
     let solid = &scene.solids[0];
-    assert_eq!((solid.primitive, solid.at), (1, Place { line: 4, column: 10 }));
+    assert_eq!(solid.primitive, 1);
     let leaf = |node: &SolidNode| match node {
         SolidNode::Sphere(sphere) => format!("sphere {} {}", sphere.primitive, sphere.radius),
         SolidNode::Parallelepiped(p) => format!("parallelepiped {} {}", p.primitive, p.edges[2]),

@@ -14,7 +14,7 @@ use parts::{join, sphere, upright};
 use rtfarm_core::{
     isa::Isa,
     render::{RenderedTile, render_tile},
-    scene::{Mesh, MeshShape, MeshVertices, Place, Scene},
+    scene::{Mesh, MeshShape, MeshVertices, Scene},
 };
 use rtfarm_oracle::{
     Settings as OracleSettings, closed_forms::irradiance, eye_direction, reference_picture,
@@ -528,7 +528,6 @@ fn mesh(faces: &[[DVec3; 4]], inside_out: bool, material: u32, primitive: u32) -
         offset: DVec3::ZERO,
         material,
         primitive,
-        at: Place { line: 1, column: 1 },
     }
 }
 

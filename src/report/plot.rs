@@ -50,6 +50,8 @@ fn panel<'a>(ladder: &Ladder, area: &Area<'a>) -> Result<(), Failed<'a>> {
         .build_cartesian_2d(time.log_scale(), error.log_scale())?;
     chart
         .configure_mesh()
+        .x_labels(4)
+        .y_labels(4)
         .x_desc("time on one thread, ms")
         .y_desc("RMSE")
         .y_label_formatter(&|error| format!("{error:.0e}"))
@@ -73,7 +75,11 @@ fn panel<'a>(ladder: &Ladder, area: &Area<'a>) -> Result<(), Failed<'a>> {
             PathElement::new([(x, (y - band).max(y / 10.0)), (x, y + band)], color.stroke_width(1))
         }))?;
     }
-    chart.configure_series_labels().background_style(WHITE).draw()
+    chart
+        .configure_series_labels()
+        .position(SeriesLabelPosition::UpperRight)
+        .background_style(WHITE)
+        .draw()
 }
 
 fn rmse(rung: &Rung) -> (f64, f64) {

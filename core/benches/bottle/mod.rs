@@ -1,7 +1,7 @@
 //! The scene of the benchmarks: a lathe bottle of any number of triangles.
 
 use glam::DVec3;
-use rtfarm_core::scene::{Light, Material, MaterialPlaces, Quadrangle, Scene, Triangle, Viewport};
+use rtfarm_core::scene::{Light, Material, Quadrangle, Scene, Triangle, Viewport};
 
 /// A bottle with a bumpy label, standing on the ground.
 pub(crate) fn bottle(triangles: usize) -> Scene {
@@ -38,7 +38,6 @@ pub(crate) fn bottle(triangles: usize) -> Scene {
         reflect: 0.0,
         refract: 0.0,
         texture: None,
-        places: MaterialPlaces::default(),
     };
     Scene {
         viewport: Some(Viewport {

@@ -30,7 +30,7 @@ fn rotate(point: DVec3, axis: DVec3, degrees: f64) -> DVec3 {
 mod tests {
     use std::sync::Arc;
 
-    use rtfarm_core::scene::{MeshShape, Place};
+    use rtfarm_core::scene::MeshShape;
 
     use super::*;
 
@@ -47,7 +47,6 @@ mod tests {
             offset: DVec3::new(0.0, 0.0, 3.0),
             material: 0,
             primitive: 0,
-            at: Place { line: 1, column: 1 },
         };
         let expected = [(0.0, 2.0, 3.0), (-2.0, 0.0, 3.0), (0.0, 0.0, 3.0)].map(DVec3::from);
         let found = mesh_triangles(&mesh)[0];

@@ -2,8 +2,8 @@
 
 use glam::{DVec2, DVec3};
 use rtfarm_core::scene::{
-    Light, Material, MaterialPlaces, Operation, Parallelepiped, Place, Quadrangle, Scene, Solid,
-    SolidNode, Sphere, Triangle, Viewport,
+    Light, Material, Operation, Parallelepiped, Quadrangle, Scene, Solid, SolidNode, Sphere,
+    Triangle, Viewport,
 };
 
 use crate::random::Random;
@@ -132,7 +132,6 @@ impl Maker {
             reflect: if clear { some(&mut self.random) * 0.75 } else { 0.0 },
             refract: if is_clear { self.random.between(0.5, 2.0) } else { 0.0 },
             texture: None,
-            places: MaterialPlaces::default(),
         }
     }
 
@@ -223,7 +222,7 @@ impl Maker {
         while ready > 1 {
             ready -= self.join(&mut nodes, ready) - 1;
         }
-        Solid { nodes, primitive, at: Place { line: 1, column: 1 } }
+        Solid { nodes, primitive }
     }
 
     /// A leaf whose middle is near `center`, so that leaves overlap.

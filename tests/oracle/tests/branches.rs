@@ -2,8 +2,8 @@
 
 use glam::DVec3;
 use rtfarm_core::scene::{
-    Light, Material, MaterialPlaces, Operation, Parallelepiped, Place, Quadrangle, Scene, Solid,
-    SolidNode, Sphere, Triangle,
+    Light, Material, Operation, Parallelepiped, Quadrangle, Scene, Solid, SolidNode, Sphere,
+    Triangle,
 };
 use rtfarm_core::tile::Size;
 use rtfarm_oracle::{
@@ -20,15 +20,7 @@ fn v(x: f64, y: f64, z: f64) -> DVec3 {
 }
 
 fn material(alpha: f64, reflect: f64, refract: f64) -> Material {
-    Material {
-        name: "m".into(),
-        color: DVec3::ONE,
-        alpha,
-        reflect,
-        refract,
-        texture: None,
-        places: MaterialPlaces::default(),
-    }
+    Material { name: "m".into(), color: DVec3::ONE, alpha, reflect, refract, texture: None }
 }
 
 fn square(z: f64, material: u32, primitive: u32) -> Quadrangle {
@@ -193,7 +185,7 @@ fn a_glass_shell_cut_from_a_ball_bends_like_its_walls() {
     };
     let cut = SolidNode::Operation { operation: Operation::Difference, operands: 2 };
     let nodes = vec![ball(2., 0), ball(1., 1), cut];
-    scene.solids = vec![Solid { nodes, primitive: 0, at: Place { line: 1, column: 1 } }];
+    scene.solids = vec![Solid { nodes, primitive: 0 }];
     let clear = 0.75f64.powi(4);
     check_seen(&scene, v(-5., 0., 0.), DVec3::X, DVec3::splat(1.0 - clear) + clear * SKY);
     // Off the middle: into the glass by 1/2 and out into the hollow by 2, from its reversed

@@ -2,7 +2,7 @@
 
 use glam::DVec3;
 use rtfarm_core::{
-    scene::{Light, Material, MaterialPlaces, Quadrangle, Scene, Sphere, Viewport},
+    scene::{Light, Material, Quadrangle, Scene, Sphere, Viewport},
     tile::Size,
 };
 use rtfarm_oracle::{
@@ -24,7 +24,6 @@ fn scene() -> (Scene, Size) {
         reflect: 0.0,
         refract: 0.0,
         texture: None,
-        places: MaterialPlaces::default(),
     };
     let viewport = Viewport {
         eye: v(0.1, 0.2, -3.0),

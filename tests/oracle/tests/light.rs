@@ -4,7 +4,7 @@
 
 use glam::DVec3;
 use rtfarm_core::{
-    scene::{Light, Material, MaterialPlaces, Quadrangle, Scene, Sphere, Viewport},
+    scene::{Light, Material, Quadrangle, Scene, Sphere, Viewport},
     tile::Size,
 };
 use rtfarm_oracle::{FaceId, Oracle, Settings, grid_positions, reference_picture};
@@ -16,15 +16,7 @@ fn v(x: f64, y: f64, z: f64) -> DVec3 {
 }
 
 fn material(color: DVec3) -> Material {
-    Material {
-        name: "m".into(),
-        color,
-        alpha: 1.0,
-        reflect: 0.0,
-        refract: 0.0,
-        texture: None,
-        places: MaterialPlaces::default(),
-    }
+    Material { name: "m".into(), color, alpha: 1.0, reflect: 0.0, refract: 0.0, texture: None }
 }
 
 fn light(position: DVec3) -> Light {

@@ -1,7 +1,7 @@
 //! The oracle's constructive solids against set algebra.
 
 use glam::DVec3;
-use rtfarm_core::scene::{Operation, Parallelepiped, Place, Scene, Solid, SolidNode, Sphere};
+use rtfarm_core::scene::{Operation, Parallelepiped, Scene, Solid, SolidNode, Sphere};
 use rtfarm_oracle::{
     Hit, Leaving, Oracle,
     random::Random,
@@ -32,7 +32,7 @@ fn operation(operation: Operation, operands: u32) -> SolidNode {
 }
 
 fn scene_of(nodes: Vec<SolidNode>) -> Scene {
-    let solid = Solid { nodes, primitive: 0, at: Place { line: 1, column: 1 } };
+    let solid = Solid { nodes, primitive: 0 };
     Scene { solids: vec![solid], ..Scene::default() }
 }
 
