@@ -286,6 +286,7 @@ fn build_node(part: Part<'_>, level: usize) -> Vec<Node> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::long::tell;
 
     fn check(boxes: &[([f32; 3], [f32; 3])]) -> Vec<Node> {
         let mut leaflets: Vec<Leaflet> = boxes
@@ -343,9 +344,10 @@ mod tests {
     #[test]
     fn coincident_faces_are_halved_not_split_for_ever() {
         let nodes = check(&vec![([0.5; 3], [0.5; 3]); 100_000]);
-        eprintln!(
-            "case 29: boxes with one middle end in leaves: {} nodes for 100 000",
-            nodes.len()
+        tell(
+            29,
+            "boxes with one middle end in leaves",
+            format!("{} nodes for 100 000", nodes.len()),
         );
     }
 
@@ -357,7 +359,8 @@ mod tests {
             .map(|x| ([x; 3], [x; 3]))
             .collect();
         let nodes = check(&boxes);
-        eprintln!("case 30: middles one ulp apart end in leaves: {} nodes for 1000", nodes.len());
+        let measured = format!("{} nodes for 1000", nodes.len());
+        tell(30, "middles one ulp apart end in leaves", measured);
     }
 
     type Cutter = fn(&Part<'_>) -> Option<(usize, usize, f32)>;
@@ -423,10 +426,10 @@ mod tests {
             cost(part, cutter, area)
         };
         let (binned, swept) = (cost_of(None), cost_of(Some(swept_cut as Cutter)));
-        eprintln!(
-            "case 31: a teapot in a stadium a million times its size costs as with a full sweep: \
-             {:.3} times {swept:.1}",
-            binned / swept
+        tell(
+            31,
+            "a teapot in a stadium a million times its size costs as with a full sweep",
+            format!("{:.3} times {swept:.1}", binned / swept),
         );
         assert!(binned <= 1.1 * swept);
     }

@@ -53,3 +53,7 @@ pub mod tile;
 pub mod trace;
 mod triangle;
 mod wavefront;
+
+#[cfg(test)]
+#[path = "../tests/long/mod.rs"]
+mod long;

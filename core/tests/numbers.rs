@@ -630,7 +630,8 @@ fn needles_and_concave_quadrangles_are_met_where_the_oracle_meets_them() {
 
 #[test]
 fn a_quadrangle_with_three_corners_in_a_line_is_a_triangle() {
-    let (mut count, mut hits, mut close, mut worst) = (0, 0, 0, 0.0_f64);
+    let (mut count, mut hits, mut close) = (0, 0, 0);
+    let (mut worst, mut farthest) = (0.0_f64, 0.0_f64);
     for seed in 0..100 {
         let mut random = random(3500 + seed);
         // Round numbers, so that the corner in between is in the line exactly.
@@ -656,7 +657,11 @@ fn a_quadrangle_with_three_corners_in_a_line_is_a_triangle() {
         let found = flat.probe(&probes, Isa::fastest());
         for (k, truth) in triangle.probe(&probes, Isa::fastest()).into_iter().enumerate() {
             if found[k].is_some() != truth.is_some() {
-                assert!(k % 4 == 0, "{seed}: {:?}", probes[k]);
+                // The corner in between is rounded on its way to the screen, as all corners are.
+                let Probe { origin, direction, .. } = probes[k];
+                let across = (c - b).cross(direction).normalize();
+                let distance = (origin - b).dot(across).abs();
+                farthest = farthest.max(distance / (f64::EPSILON * origin.length()));
                 close += 1;
             }
             if let (Some(found), Some(truth)) = (found[k], truth) {
@@ -672,11 +677,11 @@ fn a_quadrangle_with_three_corners_in_a_line_is_a_triangle() {
         35,
         "a quadrangle with three corners in a line has the triangle's hits",
         format!(
-            "{count} rays, {hits} hits, t within {worst:.1} ulp across the face; {close} of those \
-             at edges fall to the other side"
+            "{count} rays, {hits} hits, t within {worst:.1} ulp across the face; {close} of the \
+             rays at the halved edge fall to its other side, {farthest:.1} ulp of |o| from it at most"
         ),
     );
-    assert!(worst <= 8.0);
+    assert!(worst <= 8.0 && farthest <= 8.0);
 }
 
 #[test]

@@ -1,12 +1,14 @@
 //! Image files of all formats against the texels that they give, and textured faces against what
 //! is to be seen of them.
 
+mod long;
 mod studio;
 
 use std::{fs, io::Cursor, ops::ControlFlow, path::Path};
 
 use glam::DVec2;
 use image::{DynamicImage, ImageFormat, RgbImage, RgbaImage};
+use long::tell;
 use rtfarm_core::{
     isa::Isa,
     read::read_scene,
@@ -384,6 +386,7 @@ fn an_image_of_one_texel_is_a_colour() {
 /// The mean that a grazing footprint, ten thousand times longer than wide, sees of an image.
 #[test]
 fn a_footprint_of_ten_thousand_to_one_keeps_the_mean() {
+    let mut worst_off = 0.0_f64;
     for image in [noise(64, 64), noise(37, 53), noise(1, 1), noise(1000, 3)] {
         // One row of pixels just below the horizon: 1e4 images deep, a twentieth across.
         let scene = read(
@@ -403,9 +406,14 @@ fn a_footprint_of_ten_thousand_to_one_keeps_the_mean() {
         let truth = truth.map(|sum| sum / (255.0 * count));
         let found = picture(&scene, &settings(64, 1, 1));
         let off = found.iter().map(|pixel| worst(&[*pixel], &[truth])).fold(0.0, f64::max);
-        eprintln!("{:?}: off by {off:.1e}", image.dimensions());
         assert!(off < 1e-6, "{:?}: off by {off:e}", image.dimensions());
+        worst_off = worst_off.max(off);
     }
+    tell(
+        64,
+        "images of 1 x 1 to 1000 x 3 texels, seen at 1e4 to 1, keep their mean",
+        format!("off by {worst_off:.1e} at most"),
+    );
 }
 
 /// A square with the image between these coordinates across and twice down.
