@@ -14,6 +14,13 @@ use crate::{
 /// Source: Shimrat, "Algorithm 112: Position of point relative to polygon" (1962).
 #[inline(always)]
 pub(crate) fn is_inside(corners: &[Projected; 4]) -> bool {
+    is_inside_in_doubt(corners, &mut false)
+}
+
+/// The same; sets `is_in_doubt` where rounded products do not suffice and their lost digits are
+/// asked.
+#[inline(always)]
+pub(crate) fn is_inside_in_doubt(corners: &[Projected; 4], is_in_doubt: &mut bool) -> bool {
     let mut inside = false;
     for (k, a) in corners.iter().enumerate() {
         let b = &corners[(k + 1) % 4];
@@ -21,7 +28,12 @@ pub(crate) fn is_inside(corners: &[Projected; 4]) -> bool {
         let upward = b.y > 0.0;
         if upward != (a.y > 0.0) {
             let rounded = edge(a, b);
-            let left = if rounded == 0.0 { side(a, b) > 0 } else { rounded > 0.0 };
+            let left = if rounded == 0.0 {
+                *is_in_doubt = true;
+                side(a, b) > 0
+            } else {
+                rounded > 0.0
+            };
             inside ^= left == upward;
         }
     }

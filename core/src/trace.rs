@@ -9,11 +9,11 @@ use crate::{
     isa::Isa,
     node::{BoxKernel, BoxRay, Child, ScalarBoxes},
     prepared::{LightRecord, PreparedScene, View},
-    quadrangle::{hit_plane, hit_quadrangle, is_inside},
+    quadrangle::{hit_plane, hit_quadrangle, is_inside, is_inside_in_doubt},
     ray::{Hit, Item, Kind, Ray, Shear, Surface},
     solid::Scratch,
     sphere::{hit_sphere, hit_sphere_again},
-    triangle::hit_triangle,
+    triangle::{hit_triangle, hit_triangle_in_doubt},
 };
 
 /// Children that may wait while a ray visits others: seven on each level and the last node's.
@@ -423,6 +423,37 @@ pub struct ProbeHit {
     pub face: u32,
 }
 
+/// Tests of rays against triangles and quadrangles.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct FaceTests {
+    /// How many.
+    pub all: u64,
+    /// Those among them that needed the digits that rounded products lose.
+    pub in_doubt: u64,
+}
+
+impl FaceTests {
+    fn add(&mut self, view: &View<'_>, shear: &Shear, item: Item) {
+        let mut is_in_doubt = false;
+        let index = item.index();
+        let project = |corner| shear.project(corner);
+        let mut test_triangle = |vertices| {
+            hit_triangle_in_doubt(view.corners(vertices).map(project), &mut is_in_doubt);
+        };
+        match item.kind() {
+            Some(Kind::Triangle) => test_triangle(&view.triangles[index].vertices),
+            Some(Kind::Coplanar) => test_triangle(&view.coplanars[index].vertices),
+            Some(Kind::Quadrangle) => {
+                let corners = view.corners(&view.quadrangles[index].vertices).map(project);
+                is_inside_in_doubt(&corners, &mut is_in_doubt);
+            }
+            _ => return,
+        }
+        self.all += 1;
+        self.in_doubt += u64::from(is_in_doubt);
+    }
+}
+
 impl<B: AsRef<[u8]>> PreparedScene<B> {
     /// What each probe meets first, found with the kernels of `isa`, which must be supported.
     pub fn probe(&self, probes: &[Probe], isa: Isa) -> Vec<Option<ProbeHit>> {
@@ -467,6 +498,25 @@ impl<B: AsRef<[u8]>> PreparedScene<B> {
             visits
         };
         probes.iter().map(&mut count).collect()
+    }
+
+    /// How many triangles and quadrangles the probes are tested against on their way to what
+    /// they meet first, and of how many tests rounded products did not suffice.
+    pub fn count_face_tests(&self, probes: &[Probe]) -> FaceTests {
+        let view = self.view();
+        let (mut scratch, mut stack) = (Scratch::default(), Stack::default());
+        let mut tests = FaceTests::default();
+        for probe in probes {
+            let ray = to_ray(&view, probe);
+            let mut nearest = Nearest::new(&ray);
+            let shear = nearest.shear;
+            visit::<ScalarBoxes>(&view, &ray, &mut stack, |item| {
+                tests.add(&view, &shear, item);
+                nearest.meet(&view, item, &mut scratch);
+                Step::On(nearest.hit.t)
+            });
+        }
+        tests
     }
 
     /// How many faces each probe crosses.

@@ -255,3 +255,31 @@ fn closed_surfaces_are_crossed_as_often_as_the_oracle_counts() {
         format!("{same} rays; {close} more graze an edge within rounding"),
     );
 }
+
+#[test]
+fn rounded_products_suffice_but_for_rays_at_edges() {
+    let share = |make: Make, aim: Option<bool>| {
+        let surface = make((0.0, 1.0));
+        let mut random = random(400);
+        let probes: Vec<Probe> = (0..few_rays(20_000))
+            .map(|_| {
+                let target = match aim {
+                    Some(is_corner) => target(&surface, is_corner, &mut random),
+                    None => surface.inside[0] + random.direction(),
+                };
+                let origin = surface.inside[0] + 9.0 * random.direction();
+                Probe { origin, direction: (target - origin).normalize(), leaving: None }
+            })
+            .collect();
+        let tests = opened(&surface.scene).count_face_tests(&probes);
+        assert!(tests.all >= probes.len() as u64 / 2, "{tests:?}");
+        tests.in_doubt as f64 / tests.all as f64
+    };
+    for (kind, make) in &KINDS[..3] {
+        let [random, edges, corners] = [None, Some(false), Some(true)].map(|aim| share(*make, aim));
+        eprintln!(
+            "{kind}: tests in doubt: {random:.1e} of all, {edges:.1e} at edges, {corners:.1e} at corners"
+        );
+        assert!(random < 1e-2 && corners > 0.0, "{kind}: {random} {corners}");
+    }
+}
