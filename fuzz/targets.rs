@@ -64,16 +64,20 @@ pub(crate) fn image(data: &[u8]) {
 }
 
 /// What a prepared scene is made from before its bytes are changed: with all kinds of faces, and
-/// light that is mirrored, bent and let through; with solids and nothing else; with one triangle.
-const SCENES: [&str; 3] = [
+/// light that is mirrored, bent and let through; with solids and nothing else; with one triangle;
+/// with an image.
+const SCENES: [&str; 4] = [
     include_str!("prepared/all.rt"),
     include_str!("prepared/solids.rt"),
     include_str!("prepared/triangle.rt"),
+    include_str!("prepared/textured.rt"),
 ];
 
+const IMAGE: &[u8] = include_bytes!("corpus/image/rgb.png");
+
 static PREPARED: LazyLock<Vec<Vec<u8>>> = LazyLock::new(|| {
-    let nothing = |_: &str| Err(std::io::ErrorKind::NotFound.into());
-    let scene = |text: &str| read_scene(text.as_bytes(), &nothing).scene.expect("no errors");
+    let image = |_: &str| Ok(IMAGE.to_vec());
+    let scene = |text: &str| read_scene(text.as_bytes(), &image).scene.expect("no errors");
     let block = |text: &&str| prepare(&scene(text)).expect("a plain scene").as_ref().to_vec();
     SCENES.iter().map(block).collect()
 });
@@ -86,7 +90,7 @@ const HASH: std::ops::Range<usize> = 16..48;
 ///
 /// The first byte chooses the scene, or says that a whole block follows. Then come changes of four
 /// bytes each: what kind and where, where, where, what. So they mean the same in every layout, or
-/// nearly.
+/// nearly. A rest of two bytes or three asks for adaptive samples.
 pub(crate) fn prepared(data: &[u8]) {
     let Some((&first, changes)) = data.split_first() else { return };
     let mut block = match PREPARED.get(usize::from(first)) {
@@ -106,7 +110,10 @@ pub(crate) fn prepared(data: &[u8]) {
         Ok(scene) => scene,
         Err(error) => return assert_ne!(error, PreparedError::Damaged, "the hash has moved"),
     };
-    let sampling = Sampling::Fixed(1);
+    let sampling = match changes.len() % 4 {
+        0 | 1 => Sampling::Fixed(1),
+        _ => Sampling::Adaptive { error: 0.1, most: 16 },
+    };
     let quality = Quality { sampling, cutoff: 0.01, ..Quality::default() };
     let settings = Settings { size: Size::new(4, 4).expect("a size"), quality };
     let area = Area { x0: 0, y0: 0, width: 4, height: 4 };
