@@ -9,6 +9,7 @@ use crate::{
     prepared::View,
     ray::{Hit, Ray},
     sample::Sample,
+    spread::Patch,
     trace::{self, trace},
     wavefront::{Point, face_normal, surface_color},
 };
@@ -112,7 +113,7 @@ impl Gatherer {
                 let outward = face_normal(view, hit, position);
                 let is_front = outward.dot(ray.direction) <= 0.0;
                 // A texture's truth: a mean over all samples needs no coarser level.
-                let finest = Some([DVec3::ZERO; 2]);
+                let finest = Some(Patch::POINT);
                 self.sources.push(Point {
                     sample: seeker.point,
                     node: 0,

@@ -14,6 +14,20 @@ pub(crate) struct Spread {
     direction: [DVec3; 2],
 }
 
+/// The part of a flat face that belongs to a sample: what its rays at (s, t), each from -1/2 to
+/// 1/2, meet at the middle + (s · first side + t · second side) / (1 + s · first taper + t · second
+/// taper).
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Patch {
+    pub(crate) sides: [DVec3; 2],
+    pub(crate) tapers: [f64; 2],
+}
+
+impl Patch {
+    /// A single point.
+    pub(crate) const POINT: Self = Self { sides: [DVec3::ZERO; 2], tapers: [0.0; 2] };
+}
+
 impl Spread {
     /// Of a camera ray towards `target` (seen from the eye), which a sample's `steps` move.
     pub(crate) fn of_camera(target: DVec3, steps: [DVec3; 2]) -> Self {
@@ -30,6 +44,12 @@ impl Spread {
             moved - (moved.dot(normal) / direction.dot(normal)) * direction
         });
         Self { origin, ..*self }
+    }
+
+    /// What the sample sees of a flat face: a ray along `direction` has just met it.
+    pub(crate) fn patch(&self, direction: DVec3, normal: DVec3) -> Patch {
+        let tapers = self.direction.map(|step| step.dot(normal) / direction.dot(normal));
+        Patch { sides: self.origin, tapers }
     }
 
     /// After a mirror: `direction` came in, towards the side of the unit `normal`; a step along the
@@ -130,6 +150,24 @@ mod tests {
                     assert!(off < 1e-7, "{is_round} {ratio:?} {k}: {off:e}, {after}");
                 }
             }
+        }
+    }
+
+    #[test]
+    fn a_patch_reaches_to_the_horizon_as_rays_do() {
+        // A floor one below the eye, seen from 2 to 3 hundredths below the horizon.
+        let (normal, target) = (DVec3::Y, DVec3::new(0.3, -0.025, -1.0));
+        let steps = [DVec3::X * 0.01, DVec3::Y * 0.01];
+        let met = |target: DVec3| target / -target.y;
+        let (direction, t) = (target.normalize(), met(target).length());
+        let spread = Spread::of_camera(target, steps).transfer(direction, t, normal);
+        let Patch { sides, tapers } = spread.patch(direction, normal);
+        for (s, t) in [(-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5), (0.0, 0.5), (0.2, -0.1)]
+        {
+            let truth = met(target + s * steps[0] + t * steps[1]) - met(target);
+            let found = (s * sides[0] + t * sides[1]) / (1.0 + s * tapers[0] + t * tapers[1]);
+            let off = (found - truth).length() / truth.length();
+            assert!(off < 0.005, "{s} {t}: {found}, not {truth}");
         }
     }
 }

@@ -6,28 +6,33 @@ use crate::{
     prepared::{TexturedFace, View},
     pyramid::LevelRecord,
     ray::{Hit, Kind},
+    spread::Patch,
     texcoord::Chart,
 };
 
 /// The most probes along a footprint's longer axis, and so how much longer than wide a footprint
 /// may be that is not blurred.
-const MOST_PROBES: f64 = 16.0;
+const MOST_PROBES: f64 = 32.0;
 
-/// A part of an image: a parallelogram in texture coordinates.
+/// How near the far end of a footprint is taken to be, of its middle, at the horizon.
+const LEAST_NEARNESS: f64 = 1.0 / 64.0;
+
+/// A part of an image, in texture coordinates: see [`Patch`].
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Footprint {
     pub(crate) center: DVec2,
     pub(crate) sides: [DVec2; 2],
+    pub(crate) tapers: [f64; 2],
 }
 
-/// What multiplies the colour of a face at a hit: its texture, seen through a footprint that is
-/// `steps` wide along the face. White where the face has no texture coordinates.
+/// What multiplies the colour of a face at a hit: its texture, of which the sample sees `patch`.
+/// White where the face has no texture coordinates.
 pub(crate) fn texture_color(
     view: &View<'_>,
     texture: u32,
     hit: &Hit,
     (position, outward): (DVec3, DVec3),
-    steps: [DVec3; 2],
+    patch: Patch,
 ) -> DVec3 {
     let faces = view.textured_faces;
     let Ok(face) = faces.binary_search_by_key(&hit.rank, |face| face.rank) else {
@@ -51,7 +56,8 @@ pub(crate) fn texture_color(
     let place = chart.place(position);
     let footprint = Footprint {
         center: texcoords.at(place),
-        sides: steps.map(|step| texcoords.step(place, chart.step(place, step))),
+        sides: patch.sides.map(|side| texcoords.step(place, chart.step(place, side))),
+        tapers: patch.tapers,
     };
     view.texture(texture).mean(&footprint)
 }
@@ -65,13 +71,13 @@ pub(crate) struct TextureView<'a> {
 }
 
 impl TextureView<'_> {
-    /// The mean over a footprint, nearly: equal probes along its longer axis, each as wide as its
-    /// shorter one. A footprint within a texel gives the image itself, bilinear between the middles
+    /// The mean over a footprint, nearly: probes along its longer axis, each as wide as its shorter
+    /// one is there. A footprint within a texel gives the image itself, bilinear between the middles
     /// of texels.
     pub(crate) fn mean(&self, footprint: &Footprint) -> DVec3 {
         // Source: McCormack, Perry, Farkas & Jouppi, "Feline: Fast Elliptical Lines for Anisotropic
-        // Texture Mapping" (1999), but with the axes of the footprint's own ellipse and equal
-        // weights, which fit a pixel's square.
+        // Texture Mapping" (1999), but with the axes of the footprint's own ellipse, equal weights,
+        // which fit a pixel's square, and probes at equal distances on the screen, not the image.
         let size = self.size();
         let [a, b] = footprint.sides.map(|side| side * size);
         // The longer axis is an eigenvector of [a b] [a b]ᵀ.
@@ -93,14 +99,22 @@ impl TextureView<'_> {
         let axis_length = axis.length();
         // A circle has no longer axis.
         let direction = if axis_length > 0.0 { axis / axis_length } else { DVec2::X };
-        let width = (a.perp_dot(b).abs() / length).max(length / MOST_PROBES).max(1.0);
+        let minor = a.perp_dot(b).abs() / length;
+        let width = minor.max(length / MOST_PROBES).max(1.0);
         let count = (length / width).ceil().min(MOST_PROBES);
         // From end to end, so that a footprint grows into a second probe without a jump.
-        let step = direction * ((length - width) / (count - 1.0).max(1.0)) / size;
+        let step = (length - width) / (count - 1.0).max(1.0);
+        let taper = (a.dot(direction) * footprint.tapers[0]
+            + b.dot(direction) * footprint.tapers[1])
+            / (length * length);
         let mut sum = DVec3::ZERO;
         for k in 0..count as u32 {
-            let from_center = f64::from(k) - (count - 1.0) / 2.0;
-            sum += self.trilinear(width, footprint.center + from_center * step);
+            let along = (f64::from(k) - (count - 1.0) / 2.0) * step;
+            // Beyond the horizon there is nothing to see.
+            let growth = 1.0 / (1.0 + along * taper).max(LEAST_NEARNESS);
+            let wide = (width * growth * growth).max(minor * growth).max(1.0);
+            let at = footprint.center + direction * (along * growth) / size;
+            sum += self.trilinear(wide, at);
         }
         sum / count
     }
@@ -188,7 +202,11 @@ mod tests {
     }
 
     fn footprint(center: [f64; 2], sides: [[f64; 2]; 2]) -> Footprint {
-        Footprint { center: DVec2::from_array(center), sides: sides.map(DVec2::from_array) }
+        Footprint {
+            center: DVec2::from_array(center),
+            sides: sides.map(DVec2::from_array),
+            tapers: [0.0; 2],
+        }
     }
 
     #[test]

@@ -15,7 +15,7 @@ use crate::{
     ray::{Hit, Kind, Ray, Surface},
     render::{Quality, Settings},
     sample::{Sample, node_after},
-    spread::Spread,
+    spread::{Patch, Spread},
     texture_sampling::texture_color,
     trace::{self, trace, trace_shadows},
     triangle::triangle_normal,
@@ -196,7 +196,7 @@ impl Batch {
         let spread =
             self.spreads.get(index).map(|spread| spread.transfer(ray.direction, hit.t, normal));
         if reflect < 1.0 && alpha > 0.0 {
-            let steps = spread.map(|spread| spread.origin);
+            let patch = spread.map(|spread| spread.patch(ray.direction, normal));
             self.points.push(Point {
                 sample,
                 node,
@@ -204,7 +204,7 @@ impl Batch {
                 position,
                 normal,
                 surface,
-                color: surface_color(view, material, hit, (position, outward), steps),
+                color: surface_color(view, material, hit, (position, outward), patch),
                 light: DVec3::from_array(view.header.lighting.ambient),
             });
         }
@@ -307,19 +307,19 @@ impl Batch {
     }
 }
 
-/// The colour of a face at a hit, its texture included, which is seen through a footprint that is
-/// `steps` wide along the face. They are none in a scene without textures.
+/// The colour of a face at a hit, its texture included, of which the sample sees `patch`. There is
+/// none in a scene without textures.
 pub(crate) fn surface_color(
     view: &View<'_>,
     material: &MaterialRecord,
     hit: &Hit,
     at: (DVec3, DVec3),
-    steps: Option<[DVec3; 2]>,
+    patch: Option<Patch>,
 ) -> DVec3 {
     let color = DVec3::from_array(material.color);
-    match steps {
-        Some(steps) if material.texture != MaterialRecord::PLAIN => {
-            color * texture_color(view, material.texture, hit, at, steps)
+    match patch {
+        Some(patch) if material.texture != MaterialRecord::PLAIN => {
+            color * texture_color(view, material.texture, hit, at, patch)
         }
         _ => color,
     }

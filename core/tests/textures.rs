@@ -318,7 +318,7 @@ fn a_checkerboard_fades_to_its_mean_at_the_horizon() {
         errors.push((far, worst, rms));
     }
     let (far, worst, rms) = errors[0];
-    assert!(far < 0.12 && worst < 0.15 && rms < 0.02, "at one sample: {errors:?}");
+    assert!(far < 0.02 && worst < 0.1 && rms < 0.012, "at one sample: {errors:?}");
     assert!(errors[2..].windows(2).all(|pair| pair[1].2 < 0.7 * pair[0].2), "{errors:?}");
     assert!(errors[4].2 < 0.008, "{errors:?}");
 }
@@ -387,7 +387,7 @@ fn an_image_of_one_texel_is_a_colour() {
 #[test]
 fn a_footprint_of_ten_thousand_to_one_keeps_the_mean() {
     let mut worst_off = 0.0_f64;
-    for image in [noise(64, 64), noise(37, 53), noise(1, 1), noise(1000, 3)] {
+    for image in [noise(64, 64), noise(37, 53), noise(1, 1), noise(200, 3)] {
         // One row of pixels just below the horizon: 1e4 images deep, a twentieth across.
         let scene = read(
             "viewport origin 0 0 0 topleft -1 -0.00005 -1 bottomleft -1 -0.0001 -1
@@ -411,7 +411,7 @@ fn a_footprint_of_ten_thousand_to_one_keeps_the_mean() {
     }
     tell(
         64,
-        "images of 1 x 1 to 1000 x 3 texels, seen at 1e4 to 1, keep their mean",
+        "images of 1 x 1 to 200 x 3 texels, seen at 1e4 to 1, keep their mean",
         format!("off by {worst_off:.1e} at most"),
     );
 }
