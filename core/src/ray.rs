@@ -163,6 +163,17 @@ impl Shear {
             z: self.slopes[2] * depth,
         }
     }
+
+    /// Of each vertex. A loop, for the closure of a `map` is called where a kernel is compiled for
+    /// an instruction set.
+    #[inline(always)]
+    pub(crate) fn project_all<const N: usize>(&self, vertices: [&[f64; 3]; N]) -> [Projected; N] {
+        let mut projected = [Projected { x: 0.0, y: 0.0, z: 0.0 }; N];
+        for (projected, vertex) in projected.iter_mut().zip(vertices) {
+            *projected = self.project(vertex);
+        }
+        projected
+    }
 }
 
 /// On which side of the directed edge from `a` to `b` the ray passes: twice the signed area of
