@@ -144,7 +144,7 @@ impl Gatherer {
                     normal: if is_front { outward } else { -outward },
                     surface,
                     color: surface_color(view, material, hit, (position, outward), finest),
-                    light: DVec3::from_array(view.header.lighting.ambient),
+                    light: view.header.lighting.ambient(),
                 });
             }
         }

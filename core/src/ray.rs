@@ -2,6 +2,8 @@
 
 use glam::DVec3;
 
+use crate::left_out;
+
 /// A half-line, with what it must not meet.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Ray {
@@ -99,7 +101,7 @@ impl Item {
             1 => Some(Kind::Coplanar),
             2 => Some(Kind::Quadrangle),
             3 => Some(Kind::Sphere),
-            4 => Some(Kind::Solid),
+            4 if !left_out::SOLID => Some(Kind::Solid),
             _ => None,
         }
     }

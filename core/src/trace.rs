@@ -44,10 +44,10 @@ pub(crate) fn trace_shadows(
 ) {
     shares.clear();
     let touches = view.touches(light);
-    if view.header.features.has_clear_shadows == 0 {
-        dispatch(view, isa, &mut Shadows { rays, touches, shares });
-    } else {
+    if view.header.features.has_clear_shadows() {
         dispatch(view, isa, &mut ClearShadows { rays, touches, shares });
+    } else {
+        dispatch(view, isa, &mut Shadows { rays, touches, shares });
     }
 }
 
