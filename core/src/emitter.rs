@@ -11,6 +11,7 @@ use glam::DVec3;
 use crate::{
     emitter_tree::Survey,
     prepared::{EmitterRecord, Features, View},
+    sample::GatherNumbers,
 };
 
 /// A place on a surface that receives light.
@@ -67,29 +68,29 @@ fn sky_probability(promise: &Promise) -> f64 {
     if sky < MOST_SKY && promise.share < FULL_SHARE { sky } else { 1.0 }
 }
 
-/// Chooses a direction by three numbers in 0..1: one sample from a mixture of the cosine-weighted
+/// Chooses a direction: one sample from a mixture of the cosine-weighted
 /// sky and all emitters. `None` where the one chosen leads below the receiver's horizon.
 ///
 /// Source: Veach & Guibas, "Optimally Combining Sampling Techniques for Monte Carlo Rendering"
 /// (1995): the balance heuristic, here for the light of each emitter on its own, so that only the
 /// chosen one's density must be known.
-pub(crate) fn aim(view: &View<'_>, receiver: &Receiver, numbers: [f64; 3]) -> Option<Aim> {
-    let [choice, u, v] = numbers;
+pub(crate) fn aim(view: &View<'_>, receiver: &Receiver, numbers: &GatherNumbers) -> Option<Aim> {
     if view.header.features.has_emitters == Features::UNAIMED {
-        return toward_sky(receiver, 1.0, [u, v]);
+        return toward_sky(receiver, 1.0, numbers.direction());
     }
     let survey = Survey::new(view, receiver);
     let sky = sky_probability(survey.total());
+    let choice = if sky < 1.0 { numbers.choice() } else { 0.0 };
     if choice < sky {
-        return toward_sky(receiver, sky, [u, v]);
+        return toward_sky(receiver, sky, numbers.direction());
     }
     let rest = (choice - sky) / (1.0 - sky);
     let (index, probability) = survey.choose(view, receiver, rest)?;
     let emitter = &view.emitters[index as usize];
     let (direction, distance) = if emitter.is_sphere() {
-        (toward_sphere(emitter, receiver, [u, v])?, 0.0)
+        (toward_sphere(emitter, receiver, numbers.direction())?, 0.0)
     } else {
-        toward_polygon(view, emitter, receiver, [u, v])?
+        toward_polygon(view, emitter, receiver, numbers.direction())?
     };
     let cosine = receiver.normal.dot(direction);
     if cosine <= 0.0 || !cosine.is_finite() {
@@ -233,24 +234,6 @@ pub(crate) fn promise(view: &View<'_>, emitter: &EmitterRecord, receiver: &Recei
     let cosine = receiver.normal.dot(to_center) / distance;
     let share = sphere_share(cosine, emitter.size / distance);
     Promise { share, light: share * radiosity, square: 0.0 }
-}
-
-/// About the share of the sky that an emitter covers, in few steps: of a polygon the receiver's
-/// horizon is not looked at.
-pub(crate) fn rough_share(emitter: &EmitterRecord, receiver: &Receiver) -> f64 {
-    let to_middle = DVec3::from_array(emitter.middle) - receiver.position;
-    let squared = to_middle.length_squared();
-    let distance = squared.sqrt();
-    if emitter.is_sphere() {
-        if distance - emitter.size <= distance * SPHERE_CONTACT {
-            return 1.0;
-        }
-        let cosine = receiver.normal.dot(to_middle) / distance;
-        return sphere_share(cosine, emitter.size / distance);
-    }
-    let toward = DVec3::from_array(emitter.turned_area).dot(to_middle);
-    // `min` makes a number of 0/0.
-    (toward.abs() / ((emitter.size + PI * squared) * distance)).min(1.0)
 }
 
 /// About the share of the sky that a sphere covers whose centre is seen under an angle of this

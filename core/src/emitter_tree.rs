@@ -7,7 +7,7 @@
 use glam::DVec3;
 
 use crate::{
-    emitter::{FULL_SHARE, Promise, Receiver, promise, rough_share, sphere_share},
+    emitter::{FULL_SHARE, Promise, Receiver, promise, sphere_share},
     prepared::{EmitterNode, EmitterRecord, View},
 };
 
@@ -32,17 +32,13 @@ impl Survey {
         let mut survey =
             Self { nodes: [0; OPENED], lights: [0.0; OPENED], count: 0, total: Promise::default() };
         if view.emitters.len() <= OPENED {
-            // Where emitters are all around, the largest tell so soon.
             for record in view.emitters {
                 let emitter = &view.emitters[record.by_size as usize];
-                survey.total.share += rough_share(emitter, receiver);
-                if survey.total.share >= FULL_SHARE {
-                    return survey; // Nothing will be aimed at.
-                }
-            }
-            survey.total.share = 0.0;
-            for emitter in view.emitters {
                 survey.take(emitter.node, &promise(view, emitter, receiver));
+                // Where emitters are all around, the largest tell so soon.
+                if survey.total.share >= FULL_SHARE {
+                    break; // Nothing will be aimed at.
+                }
             }
             return survey;
         }

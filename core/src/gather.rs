@@ -1,12 +1,13 @@
-//! Light that faces send on: for each place that receives it one ray goes out, and where it meets
-//! such a face, that place is lit in its turn and gives what it can.
+//! Light that faces send on: from each place that receives it one ray goes out, where little counts
+//! only now and then, and where the ray meets such a face, that place is lit in its turn and gives
+//! what it can.
 
 use glam::DVec3;
 
 use crate::{
     emitter::{self, Aim, Receiver},
     isa::Isa,
-    prepared::View,
+    prepared::{Features, View},
     ray::{Hit, Ray},
     sample::Sample,
     spread::Patch,
@@ -17,6 +18,18 @@ use crate::{
 /// The most faces that let light through on one ray: far more than any scene has, so that
 /// rounding cannot keep a ray between two faces for ever.
 const MOST_CROSSINGS: u32 = 1 << 12;
+
+/// A place that counts this much in its sample gathers always; what counts less does so as seldom
+/// as it counts less. Light behind mirrors costs as much as any, and its noise is seen less.
+const FULL_WEIGHT: f64 = 0.25;
+
+/// The probability with which a place of this weight sends a ray: above 0.
+fn sending_chance(view: &View<'_>, weight: f64) -> f64 {
+    if view.header.features.has_emitters == Features::UNAIMED {
+        return 1.0;
+    }
+    (weight * (1.0 / FULL_WEIGHT)).clamp(f64::MIN_POSITIVE, 1.0)
+}
 
 /// Rays on their way, and what they have met.
 #[derive(Debug, Default)]
@@ -38,7 +51,7 @@ struct Seeker {
     point: usize,
     receiver: Receiver,
     aim: Aim,
-    /// What the faces behind it have let through.
+    /// What the faces behind it have let through, over the chance that it was sent.
     share: f64,
     /// How far it has come.
     distance: f64,
@@ -57,9 +70,13 @@ impl Gatherer {
         self.rays.clear();
         self.seekers.clear();
         for (k, point) in points.iter().enumerate() {
-            let receiver = Receiver { position: point.position, normal: point.normal };
             let numbers = samples[point.sample].gather_numbers(point.node);
-            let Some(aim) = emitter::aim(view, &receiver, numbers) else { continue };
+            let chance = sending_chance(view, point.weight);
+            if chance < 1.0 && numbers.sending() >= chance {
+                continue;
+            }
+            let receiver = Receiver { position: point.position, normal: point.normal };
+            let Some(aim) = emitter::aim(view, &receiver, &numbers) else { continue };
             self.rays.push(Ray {
                 origin: point.position,
                 direction: aim.direction,
@@ -67,7 +84,13 @@ impl Gatherer {
                 leaving: point.surface,
                 after: Ray::NOTHING_AHEAD,
             });
-            self.seekers.push(Seeker { point: k, receiver, aim, share: 1.0, distance: 0.0 });
+            self.seekers.push(Seeker {
+                point: k,
+                receiver,
+                aim,
+                share: 1.0 / chance,
+                distance: 0.0,
+            });
         }
         let mut ray_count = 0;
         for _ in 0..=MOST_CROSSINGS {
@@ -122,7 +145,7 @@ impl Gatherer {
                     normal: if is_front { outward } else { -outward },
                     surface,
                     color: surface_color(view, material, hit, (position, outward), finest),
-                    light: DVec3::from_array(view.header.lighting.ambient),
+                    light: view.header.lighting.ambient(),
                 });
             }
         }

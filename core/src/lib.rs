@@ -38,6 +38,7 @@ mod weld;
 mod emitter;
 mod gather;
 pub mod isa;
+pub mod left_out;
 pub mod picture;
 mod pixel;
 mod quadrangle;

@@ -11,7 +11,7 @@ use std::ops::Range;
 use glam::DVec3;
 
 use crate::{
-    bvh, emitter_tree,
+    bvh, emitter_tree, left_out,
     node::{Child, Frame, Node},
     pyramid::{LevelRecord, TextureRecord},
     ray::{Item, Kind, Surface},
@@ -93,6 +93,22 @@ impl Features {
     pub(crate) const AIMED: u32 = 1;
     /// Only all over the sky.
     pub(crate) const UNAIMED: u32 = 2;
+
+    pub(crate) fn has_branches(&self) -> bool {
+        self.has_branches == 1
+    }
+
+    pub(crate) fn has_clear_shadows(&self) -> bool {
+        self.has_clear_shadows == 1 && !left_out::TRANSPARENCY
+    }
+
+    pub(crate) fn has_emitters(&self) -> bool {
+        self.has_emitters != 0 && !left_out::SECONDARY_LIGHT
+    }
+
+    pub(crate) fn has_textures(&self) -> bool {
+        self.has_textures == 1 && !left_out::TEXTURE
+    }
 }
 
 /// Light that comes from everywhere.
@@ -101,6 +117,13 @@ impl Features {
 pub(crate) struct Lighting {
     pub(crate) background: [f64; 3],
     pub(crate) ambient: [f64; 3],
+}
+
+impl Lighting {
+    /// What a surface receives before any lamp is asked.
+    pub(crate) fn ambient(&self) -> DVec3 {
+        if left_out::AMBIENT { DVec3::ZERO } else { DVec3::from_array(self.ambient) }
+    }
 }
 
 const HASHED_FROM: usize = 16 + 32;

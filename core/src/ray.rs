@@ -2,6 +2,8 @@
 
 use glam::DVec3;
 
+use crate::left_out;
+
 /// A half-line, with what it must not meet.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Ray {
@@ -99,7 +101,7 @@ impl Item {
             1 => Some(Kind::Coplanar),
             2 => Some(Kind::Quadrangle),
             3 => Some(Kind::Sphere),
-            4 => Some(Kind::Solid),
+            4 if !left_out::SOLID => Some(Kind::Solid),
             _ => None,
         }
     }
@@ -162,6 +164,17 @@ impl Shear {
             y: (vertex[y] - self.origin[1]) - self.slopes[1] * depth,
             z: self.slopes[2] * depth,
         }
+    }
+
+    /// Of each vertex. A loop, for the closure of a `map` is called where a kernel is compiled for
+    /// an instruction set.
+    #[inline(always)]
+    pub(crate) fn project_all<const N: usize>(&self, vertices: [&[f64; 3]; N]) -> [Projected; N] {
+        let mut projected = [Projected { x: 0.0, y: 0.0, z: 0.0 }; N];
+        for (projected, vertex) in projected.iter_mut().zip(vertices) {
+            *projected = self.project(vertex);
+        }
+        projected
     }
 }
 

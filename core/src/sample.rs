@@ -56,14 +56,10 @@ impl Sample {
         self.numbers(0, self.key)
     }
 
-    /// Three numbers in `0..1` for what a place on its way gathers. Places are told apart by `node`;
-    /// the first one's numbers, whose node is 0, are spread together with the position.
-    pub(crate) fn gather_numbers(&self, node: u64) -> [f64; 3] {
-        let key = if node == 0 { self.key } else { mix(self.key ^ node) };
-        let [choice, u, v] = self.numbers(2, key);
-        // A choice among many needs more than the 23 bits of a number.
-        let more = mix(key ^ u64::from(self.index)) >> 36;
-        [choice + more as f64 * (1.0 / (1_u64 << 51) as f64), u, v]
+    /// The numbers for what a place on its way gathers. Places are told apart by `node`, and each
+    /// has a sequence of its own: its first two dimensions are the best spread ones.
+    pub(crate) fn gather_numbers(&self, node: u64) -> GatherNumbers {
+        GatherNumbers(Self { key: mix(self.key ^ node), ..*self })
     }
 
     fn numbers<const N: usize>(&self, first_dimension: u32, key: u64) -> [f64; N] {
@@ -71,6 +67,34 @@ impl Sample {
         std::array::from_fn(|k| {
             f64::from(sobol_burley::sample(self.index, first_dimension + k as u32, scramble))
         })
+    }
+}
+
+/// Random numbers for one ray that gathers, all in `0..1`.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct GatherNumbers(Sample);
+
+impl GatherNumbers {
+    /// Whether it is sent.
+    pub(crate) fn sending(&self) -> f64 {
+        self.fraction(1)
+    }
+
+    /// What it aims at. A choice among many needs more than the 23 bits of a number.
+    pub(crate) fn choice(&self) -> f64 {
+        let [choice] = self.0.numbers(2, self.0.key);
+        choice + self.fraction(0) * (1.0 / (1 << 23) as f64)
+    }
+
+    /// Its direction.
+    pub(crate) fn direction(&self) -> [f64; 2] {
+        self.0.numbers(0, self.0.key)
+    }
+
+    /// A number of 52 bits, spread no better than by chance.
+    fn fraction(&self, purpose: u64) -> f64 {
+        let bits = mix(self.0.key ^ u64::from(self.0.index) ^ purpose << 32) >> 12;
+        bits as f64 * (1.0 / (1_u64 << 52) as f64)
     }
 }
 

@@ -44,10 +44,10 @@ pub(crate) fn trace_shadows(
 ) {
     shares.clear();
     let touches = view.touches(light);
-    if view.header.features.has_clear_shadows == 0 {
-        dispatch(view, isa, &mut Shadows { rays, touches, shares });
-    } else {
+    if view.header.features.has_clear_shadows() {
         dispatch(view, isa, &mut ClearShadows { rays, touches, shares });
+    } else {
+        dispatch(view, isa, &mut Shadows { rays, touches, shares });
     }
 }
 
@@ -268,7 +268,7 @@ fn meet(
     let (t, rank) = match item.kind()? {
         Kind::Triangle => {
             let face = &view.triangles[index];
-            let corners = view.corners(&face.vertices).map(|corner| shear.project(corner));
+            let corners = shear.project_all(view.corners(&face.vertices));
             let t = hit_triangle(corners)?;
             if ray.leaving == Surface(face.rank) {
                 return None;
@@ -281,7 +281,7 @@ fn meet(
             if is_left && face.rank <= ray.after {
                 return None;
             }
-            let corners = view.corners(&face.vertices).map(|corner| shear.project(corner));
+            let corners = shear.project_all(view.corners(&face.vertices));
             let t = hit_triangle(corners)?;
             if is_left {
                 return Some((0.0, face.rank, 0));
@@ -297,7 +297,7 @@ fn meet(
             if is_left && face.rank <= ray.after {
                 return None;
             }
-            let corners = view.corners(&face.vertices).map(|corner| shear.project(corner));
+            let corners = shear.project_all(view.corners(&face.vertices));
             if is_left {
                 return is_inside(&corners).then_some((0.0, face.rank, 0));
             }

@@ -11,6 +11,7 @@ use glam::DVec3;
 use crate::{
     gather::Gatherer,
     isa::Isa,
+    left_out,
     prepared::{MaterialRecord, PlaneIndex, View},
     ray::{Hit, Kind, Ray, Surface},
     render::{Quality, Settings},
@@ -40,7 +41,7 @@ pub(crate) struct CameraSample {
 /// Samples on their way, and the queues that they pass through.
 #[derive(Debug, Default)]
 pub(crate) struct Batch {
-    /// The random numbers of each sample.
+    /// The random numbers of each sample; empty where nothing gathers.
     samples: Vec<Sample>,
     /// The rays of the current depth, and what each adds to.
     rays: Vec<Ray>,
@@ -99,13 +100,16 @@ impl Batch {
         samples: impl Iterator<Item = CameraSample>,
     ) {
         let (size, camera) = (settings.size, &view.header.camera);
-        let has_textures = view.header.features.has_textures == 1;
+        let gathers = gathers(view, &settings.quality);
+        let has_textures = view.header.features.has_textures();
         let screen = [camera.top_left, camera.right, camera.down].map(DVec3::from_array);
         self.rays.clear();
         self.samples.clear();
         self.spreads.clear();
         self.rays.extend(samples.map(|CameraSample { x, y, sample, spread }| {
-            self.samples.push(sample);
+            if gathers {
+                self.samples.push(sample);
+            }
             let [across, down] = sample.position();
             let u = (f64::from(x) + across) / f64::from(size.width());
             let v = (f64::from(y) + down) / f64::from(size.height());
@@ -147,6 +151,7 @@ impl Batch {
     ) -> ControlFlow<(), u64> {
         let background = DVec3::from_array(view.header.lighting.background);
         let mut ray_count = 0;
+        let has_textures = view.header.features.has_textures();
         let mut depth = 0;
         while !self.rays.is_empty() {
             on_progress()?;
@@ -159,13 +164,17 @@ impl Batch {
             for index in 0..self.rays.len() {
                 let branch = self.branches[index];
                 if self.hits[index].is_some() {
-                    self.meet(view, index, quality.cutoff, depth);
+                    if has_textures {
+                        self.meet::<true>(view, index, quality.cutoff, depth);
+                    } else {
+                        self.meet::<false>(view, index, quality.cutoff, depth);
+                    }
                 } else {
                     self.colors[branch.sample] += branch.weight * background;
                 }
             }
             ray_count += self.light_points(view, quality.flat, isa);
-            if quality.secondary && !quality.flat && view.header.features.has_emitters != 0 {
+            if gathers(view, quality) {
                 ray_count += self.gather(view, isa);
             }
             for point in &self.points {
@@ -183,7 +192,13 @@ impl Batch {
     }
 
     /// Ray `index` has met a face: queues what its own light and its branches need.
-    fn meet(&mut self, view: &View<'_>, index: usize, cutoff: f64, depth: u32) {
+    fn meet<const HAS_TEXTURES: bool>(
+        &mut self,
+        view: &View<'_>,
+        index: usize,
+        cutoff: f64,
+        depth: u32,
+    ) {
         let (ray, hit) = (&self.rays[index], &self.hits[index]);
         let Branch { sample, weight, node } = self.branches[index];
         let position = ray.origin + hit.t * ray.direction;
@@ -194,7 +209,7 @@ impl Batch {
         let material = &view.materials[trace::material(view, hit.item, hit.part) as usize];
         let (reflect, alpha) = (material.reflect, material.alpha);
         let spread =
-            self.spreads.get(index).map(|spread| spread.transfer(ray.direction, hit.t, normal));
+            HAS_TEXTURES.then(|| self.spreads[index].transfer(ray.direction, hit.t, normal));
         if reflect < 1.0 && alpha > 0.0 {
             let patch = spread.map(|spread| spread.patch(ray.direction, normal));
             self.points.push(Point {
@@ -205,10 +220,10 @@ impl Batch {
                 normal,
                 surface,
                 color: surface_color(view, material, hit, (position, outward), patch),
-                light: DVec3::from_array(view.header.lighting.ambient),
+                light: view.header.lighting.ambient(),
             });
         }
-        if view.header.features.has_branches == 0 {
+        if !view.header.features.has_branches() {
             return;
         }
         let mut follow =
@@ -231,13 +246,14 @@ impl Batch {
         let mirrored = mirror(ray.direction, normal, cosine);
         let curvature = if spread.is_some() { curvature(view, hit, position, normal) } else { 0.0 };
         let mirrored_spread = spread.map(|spread| spread.mirror(ray.direction, normal, curvature));
-        if reflect > 0.0 {
+        if reflect > 0.0 && !left_out::MIRROR {
             follow(mirrored, Ray::NOTHING_AHEAD, weight * reflect, 1, mirrored_spread);
         }
-        if reflect < 1.0 && alpha < 1.0 {
+        if reflect < 1.0 && alpha < 1.0 && !left_out::TRANSPARENCY {
             let weight = weight * ((1.0 - reflect) * (1.0 - alpha));
             let ratio = if is_front { material.refract } else { 1.0 / material.refract };
-            let is_straight = material.refract == 0.0 || material.refract == 1.0;
+            let is_straight =
+                left_out::REFRACTION || material.refract == 0.0 || material.refract == 1.0;
             let bent = if is_straight {
                 Some(ray.direction)
             } else {
@@ -307,8 +323,14 @@ impl Batch {
     }
 }
 
+/// Whether places look for light that other faces send on.
+fn gathers(view: &View<'_>, quality: &Quality) -> bool {
+    quality.secondary && !quality.flat && view.header.features.has_emitters()
+}
+
 /// The colour of a face at a hit, its texture included, of which the sample sees `patch`. There is
 /// none in a scene without textures.
+#[inline(always)]
 pub(crate) fn surface_color(
     view: &View<'_>,
     material: &MaterialRecord,
@@ -318,7 +340,7 @@ pub(crate) fn surface_color(
 ) -> DVec3 {
     let color = DVec3::from_array(material.color);
     match patch {
-        Some(patch) if material.texture != MaterialRecord::PLAIN => {
+        Some(patch) if material.texture != MaterialRecord::PLAIN && !left_out::TEXTURE => {
             color * texture_color(view, material.texture, hit, at, patch)
         }
         _ => color,
