@@ -11,6 +11,7 @@ use glam::DVec3;
 
 use crate::{
     node::Child,
+    pixel::UNSEEN,
     prepared::{LeafRecord, MaterialRecord, View},
     ray::{Hit, Item, Kind},
     sample::Samples,
@@ -19,19 +20,24 @@ use crate::{
     wavefront::face_normal,
 };
 
-/// Pixels on the side of a block that is searched in one go.
-const BLOCK: u32 = 8;
+/// Pixels on the side of a block that is searched in one go, and how many faces it may hold: else
+/// it is cut into blocks of the next size. A pixel that holds more is crowded.
+const BLOCKS: [(u32, usize); 3] = [(8, 128), (2, 64), (1, MOST_FACES)];
 
-/// Faces that are looked at together. A block that has more is cut in four; a pixel that has more
-/// is so full that no face stands out, and its samples alone tell what it shows.
-const MOST_FACES: usize = 256;
+/// Faces that a pixel is searched for.
+const MOST_FACES: usize = 128;
+
+/// What stands so many pixels' widths before all that the samples of a crowded pixel met is
+/// searched for even there.
+const BEFORE: f64 = 8.0;
 
 /// A face counts in a pixel up to this many times as far as the pixel's samples met something.
 const BEYOND: f64 = 1.25;
 
-/// Of a picture's error: what a face or a pixel's faces together may add unseen without being
-/// worth a sample.
+/// Of a picture's error: what a face may add unseen without being noted, and what all faces of a
+/// pixel may add.
 const NEGLIGIBLE: f64 = 1.0 / 64.0;
+const NEGLIGIBLE_SUM: f64 = 1.0 / 8.0;
 
 /// A sphere that is larger on the screen, in pixels, is found by the samples of some pixel.
 const LARGEST_SPHERE: f64 = 2.0;
@@ -57,7 +63,7 @@ pub(crate) struct Beams<'a> {
     /// A pixel's longer side at depth 1.
     step: f64,
     shows_plain_colors: bool,
-    negligible: f64,
+    error: f64,
     outlines: Vec<Outline>,
     /// Of all outlines: place on the screen in pixels, and 1 / depth.
     corners: Vec<[f64; 3]>,
@@ -111,12 +117,17 @@ pub(crate) struct Unseen {
     faces: Vec<UnseenFace>,
     /// Of all faces.
     corners: Vec<[f64; 3]>,
+    /// How far the colour of what nobody could look through may lie from that of the pixel.
+    crowd: DVec3,
 }
 
 #[derive(Debug)]
 struct UnseenFace {
+    /// Of its corners.
     first: usize,
     count: usize,
+    /// Between which y it lies.
+    rows: [f64; 2],
     /// Of the pixel.
     share: f64,
     /// How far its colour may lie from that of the pixel.
@@ -128,12 +139,12 @@ struct UnseenFace {
 impl Unseen {
     /// Whether nothing hides.
     pub(crate) fn is_empty(&self) -> bool {
-        self.faces.is_empty()
+        self.faces.is_empty() && self.crowd == DVec3::ZERO
     }
 
     /// The expected square of what the mean of `count` samples lacks: the faces' contrast by their
     /// share of the pixel, if all samples missed them. Of a closed body only the side that faces
-    /// the eye is seen, so the sides are not added.
+    /// the eye is seen, so the sides are not added. A crowd may cover any share.
     pub(crate) fn variance(&self, count: u32) -> DVec3 {
         let mut shares = [0.0; 2];
         let mut lacks = [DVec3::ZERO; 2];
@@ -144,7 +155,20 @@ impl Unseen {
         }
         let share = shares[0].max(shares[1]);
         let lack = lacks[0].max(lacks[1]) / share.max(1.0);
+        let n = f64::from(count);
         lack * lack * power(1.0 - share.min(1.0), count)
+            + self.crowd * self.crowd * (UNSEEN / (n * n * n))
+    }
+
+    /// Takes a face out that covers a place on the screen.
+    fn take(&mut self, [x, y]: [f64; 2]) -> Option<Patch> {
+        let passed = self.faces.iter().position(|face| {
+            let [low, high] = face.rows;
+            y >= low
+                && y <= high
+                && contains(&self.corners[face.first..face.first + face.count], [x, y])
+        });
+        passed.map(|face| self.faces.remove(face).patch)
     }
 }
 
@@ -166,7 +190,7 @@ impl<'a> Beams<'a> {
             rows,
             step: right.length().max(down.length()),
             shows_plain_colors: flat || view.header.features.is_lit == 0,
-            negligible: error * NEGLIGIBLE,
+            error,
             outlines: Vec::new(),
             corners: Vec::new(),
             waiting: Vec::new(),
@@ -177,29 +201,65 @@ impl<'a> Beams<'a> {
         })
     }
 
-    /// Finds what may hide in the pixels of a block of at most [`BLOCK`] x [`BLOCK`]; `look` says
-    /// what a pixel's samples saw.
+    /// Finds what may hide in the pixels of an area; `look` says what a pixel's samples saw.
     pub(crate) fn search<'l>(
         &mut self,
-        block: Area,
+        area: Area,
         look: &impl Fn(u32, u32) -> Look<'l>,
         on_found: &mut impl FnMut(u32, u32, Unseen),
     ) {
-        let Area { x0, y0, width, height } = block;
-        let pixels = (y0..y0 + height).flat_map(|y| (x0..x0 + width).map(move |x| (x, y)));
-        let deepest =
-            pixels.clone().map(|(x, y)| self.depth_of(x, y, look(x, y).hits)).fold(0.0, f64::max);
-        if self.gather(block, deepest) {
-            for (x, y) in pixels {
-                let unseen = self.find_unseen(x, y, &look(x, y));
+        self.search_blocks(area, &BLOCKS, look, on_found);
+    }
+
+    fn search_blocks<'l>(
+        &mut self,
+        area: Area,
+        sizes: &[(u32, usize)],
+        look: &impl Fn(u32, u32) -> Look<'l>,
+        on_found: &mut impl FnMut(u32, u32, Unseen),
+    ) {
+        let Some((&(side, most), smaller)) = sizes.split_first() else {
+            let (x, y) = (area.x0, area.y0);
+            return self.search_crowded(x, y, &look(x, y), on_found);
+        };
+        for block in blocks(area, side) {
+            let deepest = pixels_of(block)
+                .map(|(x, y)| self.depth_of(x, y, look(x, y).hits))
+                .fold(0.0, f64::max);
+            if !self.gather(block, deepest, most) {
+                self.search_blocks(block, smaller, look, on_found);
+                continue;
+            }
+            for (x, y) in pixels_of(block) {
+                let look = look(x, y);
+                let unseen = self.find_unseen(x, y, &look, self.depth_of(x, y, look.hits));
                 if !unseen.is_empty() {
                     on_found(x, y, unseen);
                 }
             }
-        } else if width > 1 || height > 1 {
-            for part in quarters(block) {
-                self.search(part, look, on_found);
-            }
+        }
+    }
+
+    /// In a pixel with too many faces only those count that stand before all that was seen. If
+    /// these are too many as well nobody knows which share of the pixel they cover.
+    fn search_crowded(
+        &mut self,
+        x: u32,
+        y: u32,
+        look: &Look<'_>,
+        on_found: &mut impl FnMut(u32, u32, Unseen),
+    ) {
+        let pixel = Area { x0: x, y0: y, width: 1, height: 1 };
+        let nearest = look.hits.iter().map(|hit| hit.t).fold(f64::INFINITY, f64::min);
+        let middle = self.direction([f64::from(x) + 0.5, f64::from(y) + 0.5]).length();
+        let before = nearest / middle * (1.0 - BEFORE * self.step / middle);
+        let unseen = if self.gather(pixel, before, MOST_FACES) {
+            self.find_unseen(x, y, look, before)
+        } else {
+            Unseen { crowd: look.mean.max(DVec3::ONE - look.mean), ..Unseen::default() }
+        };
+        if !unseen.is_empty() {
+            on_found(x, y, unseen);
         }
     }
 
@@ -217,7 +277,7 @@ impl<'a> Beams<'a> {
 
     /// Collects the outlines of the faces in a block's beam up to a depth; whether there are few
     /// enough.
-    fn gather(&mut self, block: Area, deepest: f64) -> bool {
+    fn gather(&mut self, block: Area, deepest: f64, most: usize) -> bool {
         self.outlines.clear();
         self.corners.clear();
         self.waiting.clear();
@@ -229,7 +289,7 @@ impl<'a> Beams<'a> {
                 for &item in &view.items[child.items()] {
                     self.gather_item(item, block, deepest);
                 }
-                if self.outlines.len() > MOST_FACES {
+                if self.outlines.len() > most {
                     return false;
                 }
                 continue;
@@ -418,34 +478,25 @@ impl<'a> Beams<'a> {
         }
     }
 
-    /// What may hide in a pixel, among the outlines of its block.
-    fn find_unseen(&mut self, x: u32, y: u32, look: &Look<'_>) -> Unseen {
-        let deepest = self.depth_of(x, y, look.hits);
+    /// What may hide in a pixel up to a depth, among the outlines of its block.
+    fn find_unseen(&mut self, x: u32, y: u32, look: &Look<'_>, deepest: f64) -> Unseen {
         let pixel = Area { x0: x, y0: y, width: 1, height: 1 };
         let mut unseen = Unseen::default();
         let mut suspects = std::mem::take(&mut self.suspects);
         suspects.clear();
-        let mut count = 0;
-        for (index, outline) in self.outlines.iter().enumerate() {
-            if outline.nearest <= deepest && outline.meets(pixel) {
-                count += 1;
-                if look.hits.iter().all(|hit| hit.rank != outline.rank) {
-                    suspects.push(index);
-                }
-            }
-        }
-        if !suspects.is_empty() && count <= MOST_FACES {
+        suspects.extend((0..self.outlines.len()).filter(|&index| {
+            let outline = &self.outlines[index];
+            outline.nearest <= deepest
+                && outline.meets(pixel)
+                && look.hits.iter().all(|hit| hit.rank != outline.rank)
+        }));
+        if !suspects.is_empty() {
             suspects.sort_unstable_by_key(|&index| self.outlines[index].rank);
             self.note_seen(look, (x, y));
-            let places = || (0..look.hits.len()).map(|k| look.samples.sample(k as u32).place(x, y));
             for &index in &suspects {
-                self.judge(index, pixel, look, places(), &mut unseen);
+                self.judge(index, pixel, look, &mut unseen);
             }
-            if unseen.variance(look.hits.len() as u32).max_element()
-                < self.negligible * self.negligible
-            {
-                unseen = Unseen::default();
-            }
+            self.drop_negligible(&mut unseen, look.hits.len() as u32);
         }
         self.suspects = suspects;
         unseen
@@ -468,22 +519,15 @@ impl<'a> Beams<'a> {
 
     /// Adds a face to what a pixel may hide, unless it shows nothing new there, is hidden or has
     /// been passed by a sample.
-    fn judge(
-        &mut self,
-        index: usize,
-        pixel: Area,
-        look: &Look<'_>,
-        mut places: impl Iterator<Item = [f64; 2]>,
-        unseen: &mut Unseen,
-    ) {
+    fn judge(&mut self, index: usize, pixel: Area, look: &Look<'_>, unseen: &mut Unseen) {
         let outline = self.outlines[index];
         let material = trace::material(&self.view, outline.item, outline.part);
         let mut contrast = self.contrast(material, look.mean);
-        if outline.area_of_rectangle(pixel) * contrast.max_element() < self.negligible {
+        if outline.area_of_rectangle(pixel) * contrast.max_element() < NEGLIGIBLE * self.error {
             return;
         }
         let Some(piece) = self.cut_to(pixel, &outline) else { return };
-        if piece.share * contrast.max_element() < self.negligible {
+        if piece.share * contrast.max_element() < NEGLIGIBLE * self.error {
             return;
         }
         // Beyond an edge of what is seen a face may begin, but not more than a pixel behind it.
@@ -499,28 +543,43 @@ impl<'a> Beams<'a> {
         for seen in &self.seen {
             contrast = contrast.min(self.contrast_between(&patch, seen));
         }
-        if piece.share * contrast.max_element() < self.negligible {
+        if piece.share * contrast.max_element() < NEGLIGIBLE * self.error {
             return;
         }
+        let place_of = |number| look.samples.sample(number).place(pixel.x0, pixel.y0);
+        let mut places = (0..look.hits.len() as u32).map(place_of);
         if places.any(|place| contains(&self.polygon, place)) {
             return;
         }
         let (first, count) = (unseen.corners.len(), self.polygon.len());
         unseen.corners.extend(&self.polygon);
         let Piece { share, is_front, .. } = piece;
-        unseen.faces.push(UnseenFace { first, count, share, contrast, is_front, patch });
+        let rows = [outline.low[1], outline.high[1]];
+        unseen.faces.push(UnseenFace { first, count, rows, share, contrast, is_front, patch });
     }
 
-    /// What a sample of the pixel, at this place on the screen, tells of what may hide in it.
-    pub(crate) fn pass(&self, unseen: &mut Unseen, place: [f64; 2]) {
-        let Unseen { faces, corners } = unseen;
-        let is_passed =
-            |face: &UnseenFace| contains(&corners[face.first..face.first + face.count], place);
-        while let Some(passed) = faces.iter().position(is_passed) {
-            let patch = faces.remove(passed).patch;
-            for face in faces.iter_mut() {
-                face.contrast = face.contrast.min(self.contrast_between(&face.patch, &patch));
+    /// What the next samples of the pixel, at these places on the screen, tell of what may hide in
+    /// it; now there are `count`.
+    pub(crate) fn pass(
+        &self,
+        unseen: &mut Unseen,
+        places: impl Iterator<Item = [f64; 2]>,
+        count: u32,
+    ) {
+        for place in places {
+            while let Some(patch) = unseen.take(place) {
+                for face in &mut unseen.faces {
+                    face.contrast = face.contrast.min(self.contrast_between(&face.patch, &patch));
+                }
             }
+        }
+        self.drop_negligible(unseen, count);
+    }
+
+    fn drop_negligible(&self, unseen: &mut Unseen, count: u32) {
+        let lack = NEGLIGIBLE_SUM * self.error;
+        if unseen.variance(count).max_element() < lack * lack {
+            *unseen = Unseen::default();
         }
     }
 
@@ -734,29 +793,22 @@ fn shares(material: &MaterialRecord) -> Shares {
     Shares { own, other }
 }
 
-/// The four parts of a block that is wider or higher than a pixel.
-fn quarters(Area { x0, y0, width, height }: Area) -> impl Iterator<Item = Area> {
-    let (left, top) = (width.div_ceil(2), height.div_ceil(2));
-    let parts = [
-        Area { x0, y0, width: left, height: top },
-        Area { x0: x0 + left, y0, width: width - left, height: top },
-        Area { x0, y0: y0 + top, width: left, height: height - top },
-        Area { x0: x0 + left, y0: y0 + top, width: width - left, height: height - top },
-    ];
-    parts.into_iter().filter(|part| part.width > 0 && part.height > 0)
-}
-
-/// The blocks of an area, row by row.
-pub(crate) fn blocks(area: Area) -> impl Iterator<Item = Area> {
+/// An area in blocks, row by row.
+pub(crate) fn blocks(area: Area, side: u32) -> impl Iterator<Item = Area> {
     let Area { x0, y0, width, height } = area;
-    (0..height).step_by(BLOCK as usize).flat_map(move |y| {
-        (0..width).step_by(BLOCK as usize).map(move |x| Area {
+    (0..height).step_by(side as usize).flat_map(move |y| {
+        (0..width).step_by(side as usize).map(move |x| Area {
             x0: x0 + x,
             y0: y0 + y,
-            width: BLOCK.min(width - x),
-            height: BLOCK.min(height - y),
+            width: side.min(width - x),
+            height: side.min(height - y),
         })
     })
+}
+
+/// The pixels of an area, row by row.
+fn pixels_of(Area { x0, y0, width, height }: Area) -> impl Iterator<Item = (u32, u32)> {
+    (y0..y0 + height).flat_map(move |y| (x0..x0 + width).map(move |x| (x, y)))
 }
 
 /// `base` to a whole power, by squaring.

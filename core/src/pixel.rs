@@ -29,7 +29,7 @@ const EDGE: f64 = 0.65;
 /// square times n^-3. An edge that covers a share c of the pixel, all c as likely, is missed by n
 /// samples with (1 - c)^n, and the mean of c² over these is 2 n^-3; some pixels beside an edge
 /// have none.
-const UNSEEN: f64 = 1.5;
+pub(crate) const UNSEEN: f64 = 1.5;
 
 /// What a pixel shows of a contrast that runs evenly through its neighbourhood, as of a shade: a
 /// fourth. What is beyond that is unseen.

@@ -250,7 +250,7 @@ impl<'a> Sampler<'a> {
     ) -> ControlFlow<(), Hidden<'a>> {
         let seed = self.settings.quality.seed;
         let mut found = Vec::new();
-        for block in beam::blocks(area) {
+        for part in beam::blocks(area, 32) {
             (self.on_progress)()?;
             let look = |x: u32, y: u32| {
                 let pixel = index_of(wide, x, y);
@@ -261,7 +261,7 @@ impl<'a> Sampler<'a> {
                     mean: pixels[pixel as usize].mean(),
                 }
             };
-            beams.search(block, &look, &mut |x, y, unseen| {
+            beams.search(part, &look, &mut |x, y, unseen| {
                 found.push((index_of(wide, x, y), FEWEST_FOR_ERROR, unseen));
             });
         }
@@ -329,9 +329,11 @@ impl Hidden<'_> {
             let pixel = &mut pixels[*index as usize];
             let (x, y) = (area.x0 + *index % area.width, area.y0 + *index / area.width);
             let samples = Samples::new(pixel.count(), seed, x, y);
-            for number in *had..pixel.count() {
-                beams.pass(unseen, samples.sample(number).place(x, y));
+            if *had == pixel.count() || unseen.is_empty() {
+                continue;
             }
+            let places = (*had..pixel.count()).map(|number| samples.sample(number).place(x, y));
+            beams.pass(unseen, places, pixel.count());
             *had = pixel.count();
             pixel.set_hidden(unseen.variance(*had));
         }
