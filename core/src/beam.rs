@@ -53,7 +53,7 @@ const OCTAGON: f64 = 1.053_907_0;
 
 /// The search for what pixels may hide.
 pub(crate) struct Beams<'a> {
-    view: View<'a>,
+    view: &'a View<'a>,
     eye: DVec3,
     /// From the eye to the frame's top left corner, and a pixel's step to the right and down.
     screen: [DVec3; 3],
@@ -72,6 +72,8 @@ pub(crate) struct Beams<'a> {
     polygon: Vec<[f64; 3]>,
     spare: Vec<[f64; 3]>,
     suspects: Vec<usize>,
+    /// Where a pixel's first samples lie on the screen, and what they saw.
+    places: Vec<[f64; 2]>,
     seen: Vec<Patch>,
 }
 
@@ -175,7 +177,7 @@ impl Unseen {
 impl<'a> Beams<'a> {
     /// For a picture with that error; `None` where the screen is seen edge-on, so that a pixel has
     /// no beam.
-    pub(crate) fn new(view: View<'a>, size: Size, flat: bool, error: f64) -> Option<Self> {
+    pub(crate) fn new(view: &'a View<'a>, size: Size, flat: bool, error: f64) -> Option<Self> {
         let camera = &view.header.camera;
         let top_left = DVec3::from_array(camera.top_left);
         let right = DVec3::from_array(camera.right) / f64::from(size.width());
@@ -197,6 +199,7 @@ impl<'a> Beams<'a> {
             polygon: Vec::new(),
             spare: Vec::new(),
             suspects: Vec::new(),
+            places: Vec::new(),
             seen: Vec::new(),
         })
     }
@@ -502,17 +505,21 @@ impl<'a> Beams<'a> {
         unseen
     }
 
-    /// Notes what a pixel's first samples saw, each flat face once.
+    /// Notes where a pixel's first samples lie and what they saw, each flat face once.
     fn note_seen(&mut self, look: &Look<'_>, (x, y): (u32, u32)) {
+        self.places.clear();
         self.seen.clear();
-        for (k, hit) in look.hits.iter().enumerate().filter(|(_, hit)| hit.is_some()) {
-            if look.hits[..k].iter().any(|earlier| earlier.rank == hit.rank) {
+        for (number, hit) in (0..).zip(look.hits) {
+            let place = look.samples.sample(number).place(x, y);
+            self.places.push(place);
+            let earlier = &look.hits[..number as usize];
+            if !hit.is_some() || earlier.iter().any(|earlier| earlier.rank == hit.rank) {
                 continue;
             }
-            let direction = self.direction(look.samples.sample(k as u32).place(x, y));
+            let direction = self.direction(place);
             let place = direction * (hit.t / direction.length());
-            let normal = turned_to_eye(face_normal(&self.view, hit, self.eye + place), place);
-            let material = trace::material(&self.view, hit.item, hit.part);
+            let normal = turned_to_eye(face_normal(self.view, hit, self.eye + place), place);
+            let material = trace::material(self.view, hit.item, hit.part);
             self.seen.push(Patch { material, normal, place });
         }
     }
@@ -521,7 +528,7 @@ impl<'a> Beams<'a> {
     /// been passed by a sample.
     fn judge(&mut self, index: usize, pixel: Area, look: &Look<'_>, unseen: &mut Unseen) {
         let outline = self.outlines[index];
-        let material = trace::material(&self.view, outline.item, outline.part);
+        let material = trace::material(self.view, outline.item, outline.part);
         let mut contrast = self.contrast(material, look.mean);
         if outline.area_of_rectangle(pixel) * contrast.max_element() < NEGLIGIBLE * self.error {
             return;
@@ -546,9 +553,7 @@ impl<'a> Beams<'a> {
         if piece.share * contrast.max_element() < NEGLIGIBLE * self.error {
             return;
         }
-        let place_of = |number| look.samples.sample(number).place(pixel.x0, pixel.y0);
-        let mut places = (0..look.hits.len() as u32).map(place_of);
-        if places.any(|place| contains(&self.polygon, place)) {
+        if self.places.iter().any(|&place| contains(&self.polygon, place)) {
             return;
         }
         let (first, count) = (unseen.corners.len(), self.polygon.len());
@@ -638,9 +643,9 @@ impl<'a> Beams<'a> {
                 if leaf.is_sphere() {
                     return -place / place.length();
                 }
-                face_normal(&self.view, &hit, place)
+                face_normal(self.view, &hit, place)
             }
-            _ => face_normal(&self.view, &hit, place),
+            _ => face_normal(self.view, &hit, place),
         }
     }
 

@@ -2,7 +2,7 @@
 //!
 //! A pixel's samples are added in their own order, and each is a pure function of (scene,
 //! settings, pixel, sample); how many there are hangs on the first samples of the pixel and its
-//! eight neighbours, and on its own later ones. So a pixel is the same to the bit whatever the
+//! eight neighbours, on the faces in its beam, and on its own later samples. So a pixel is the same to the bit whatever the
 //! tile, the batch, the thread or the CPU.
 
 use std::ops::{ControlFlow, RangeInclusive};
@@ -149,8 +149,9 @@ pub fn render_tile<B: AsRef<[u8]>>(
     isa: Isa,
     on_progress: &mut dyn FnMut() -> ControlFlow<()>,
 ) -> Option<RenderedTile> {
+    let view = scene.view();
     let mut sampler = Sampler {
-        view: scene.view(),
+        view: &view,
         settings,
         isa,
         on_progress,
@@ -175,7 +176,7 @@ pub fn render_tile<B: AsRef<[u8]>>(
 
 /// Gives pixels their samples, a batch at a time.
 struct Sampler<'a> {
-    view: View<'a>,
+    view: &'a View<'a>,
     settings: &'a Settings,
     isa: Isa,
     on_progress: &'a mut dyn FnMut() -> ControlFlow<()>,
@@ -296,10 +297,10 @@ impl<'a> Sampler<'a> {
                 let sample = Samples::new(count, seed, x, y).sample(number);
                 CameraSample { x, y, sample, spread }
             });
-            self.batch.start(&self.view, self.settings, samples);
+            self.batch.start(self.view, self.settings, samples);
             self.tally.samples += run.end - run.start;
             self.tally.rays +=
-                self.batch.run(&self.view, &self.settings.quality, self.isa, self.on_progress)?;
+                self.batch.run(self.view, &self.settings.quality, self.isa, self.on_progress)?;
             for (index, &color) in run.zip(&self.batch.colors) {
                 pixels[pixel_of(index) as usize].add(color);
             }
