@@ -35,6 +35,7 @@ mod pyramid;
 mod weld;
 
 // A prepared scene into tiles.
+mod beam;
 mod emitter;
 mod gather;
 pub mod isa;

@@ -17,6 +17,8 @@ pub(crate) struct Pixel {
     /// How far apart the first samples of the pixel and its neighbours lie, once the neighbours
     /// have been looked at.
     contrast: Option<DVec3>,
+    /// The variance by what no sample has met and may hide in the pixel.
+    hidden: DVec3,
 }
 
 /// The variance of the mean where an edge crosses a pixel is about this times the samples' own
@@ -27,7 +29,7 @@ const EDGE: f64 = 0.65;
 /// square times n^-3. An edge that covers a share c of the pixel, all c as likely, is missed by n
 /// samples with (1 - c)^n, and the mean of c² over these is 2 n^-3; some pixels beside an edge
 /// have none.
-const UNSEEN: f64 = 1.5;
+pub(crate) const UNSEEN: f64 = 1.5;
 
 /// What a pixel shows of a contrast that runs evenly through its neighbourhood, as of a shade: a
 /// fourth. What is beyond that is unseen.
@@ -41,6 +43,7 @@ impl Default for Pixel {
             range: [DVec3::INFINITY, DVec3::NEG_INFINITY],
             count: 0,
             contrast: None,
+            hidden: DVec3::ZERO,
         }
     }
 }
@@ -75,6 +78,11 @@ impl Pixel {
         self.contrast = Some(contrast);
     }
 
+    /// Notes by how much what no sample has met may change the mean: the expected square.
+    pub(crate) fn set_hidden(&mut self, variance: DVec3) {
+        self.hidden = variance;
+    }
+
     /// The estimated variance of the mean, per channel; `None` with too few samples.
     pub(crate) fn variance(&self) -> Option<DVec3> {
         (self.count >= FEWEST_FOR_ERROR).then(|| match self.contrast {
@@ -103,14 +111,16 @@ impl Pixel {
 
     /// The variance to decide by. Four runs agree by chance now and then, and whoever stops there
     /// is wrong. So their variance, which is worth three numbers, counts as much as that of an
-    /// edge with the same samples, and what the neighbours met and this pixel did not yet is added.
+    /// edge with the same samples, and what the neighbours met and this pixel did not yet is added,
+    /// and what nobody met.
     fn careful_variance(&self, contrast: DVec3) -> DVec3 {
         let n = f64::from(self.count);
         let mean = self.mean();
         let variance = (self.squares / n - mean * mean).max(DVec3::ZERO) * (n / (n - 1.0));
         let of_edge = variance * (EDGE / (n * n.sqrt()));
         let unseen = (contrast - EVEN * (self.range[1] - self.range[0])).max(DVec3::ZERO);
-        (self.variance_of_runs() + of_edge) / 2.0 + unseen * unseen * (UNSEEN / (n * n * n))
+        let of_unseen = unseen * unseen * (UNSEEN / (n * n * n));
+        (self.variance_of_runs() + of_edge) / 2.0 + of_unseen + self.hidden
     }
 }
 

@@ -2,7 +2,7 @@
 //!
 //! A pixel's samples are added in their own order, and each is a pure function of (scene,
 //! settings, pixel, sample); how many there are hangs on the first samples of the pixel and its
-//! eight neighbours, and on its own later ones. So a pixel is the same to the bit whatever the
+//! eight neighbours, on the faces in its beam, and on its own later samples. So a pixel is the same to the bit whatever the
 //! tile, the batch, the thread or the CPU.
 
 use std::ops::{ControlFlow, RangeInclusive};
@@ -10,9 +10,11 @@ use std::ops::{ControlFlow, RangeInclusive};
 use glam::DVec3;
 
 use crate::{
+    beam::{self, Beams, Look, Unseen},
     isa::Isa,
     pixel::Pixel,
     prepared::{PreparedScene, View},
+    ray::Hit,
     sample::{FEWEST_FOR_ERROR, MOST_SAMPLES, Samples},
     tile::{Area, Size},
     wavefront::{Batch, CameraSample},
@@ -147,8 +149,9 @@ pub fn render_tile<B: AsRef<[u8]>>(
     isa: Isa,
     on_progress: &mut dyn FnMut() -> ControlFlow<()>,
 ) -> Option<RenderedTile> {
+    let view = scene.view();
     let mut sampler = Sampler {
-        view: scene.view(),
+        view: &view,
         settings,
         isa,
         on_progress,
@@ -173,7 +176,7 @@ pub fn render_tile<B: AsRef<[u8]>>(
 
 /// Gives pixels their samples, a batch at a time.
 struct Sampler<'a> {
-    view: View<'a>,
+    view: &'a View<'a>,
     settings: &'a Settings,
     isa: Isa,
     on_progress: &'a mut dyn FnMut() -> ControlFlow<()>,
@@ -181,12 +184,12 @@ struct Sampler<'a> {
     tally: Tally,
 }
 
-impl Sampler<'_> {
+impl<'a> Sampler<'a> {
     /// The pixels of `area` with `count` samples each.
     fn sample_evenly(&mut self, area: Area, count: u32) -> ControlFlow<(), Vec<Pixel>> {
         let mut pixels = vec![Pixel::default(); area.pixel_count()];
         let all: Vec<u32> = (0..pixels.len() as u32).collect();
-        self.extend(area, &mut pixels, &all, count)?;
+        self.extend(area, &mut pixels, &all, count, None)?;
         ControlFlow::Continue(pixels)
     }
 
@@ -200,7 +203,8 @@ impl Sampler<'_> {
         let (wide, inner) = with_apron(area, self.settings.size);
         let mut pixels = vec![Pixel::default(); wide.pixel_count()];
         let all: Vec<u32> = (0..pixels.len() as u32).collect();
-        self.extend(wide, &mut pixels, &all, FEWEST_FOR_ERROR)?;
+        let mut hits = Vec::with_capacity(all.len() * FEWEST_FOR_ERROR as usize);
+        self.extend(wide, &mut pixels, &all, FEWEST_FOR_ERROR, Some(&mut hits))?;
 
         // What one pixel's first samples missed its neighbours' may have found.
         let contrasts: Vec<DVec3> = inner
@@ -215,27 +219,68 @@ impl Sampler<'_> {
         for (&pixel, contrast) in inner.iter().zip(contrasts) {
             pixels[pixel as usize].set_contrast(contrast);
         }
+        let quality = &self.settings.quality;
+        let beams = Beams::new(self.view, self.settings.size, quality.flat, error);
+        let mut hidden = match beams {
+            Some(beams) => self.find_hidden(beams, area, wide, &mut pixels, &hits)?,
+            None => Hidden::default(),
+        };
+        drop(hits);
         let is_open = |pixels: &[Pixel], pixel: u32| !pixels[pixel as usize].is_below(error);
         let mut open = inner.clone();
         open.retain(|&pixel| is_open(&pixels, pixel));
         let mut count = FEWEST_FOR_ERROR;
         while !open.is_empty() && count < most {
             count = most.min(2 * count);
-            self.extend(wide, &mut pixels, &open, count)?;
+            self.extend(wide, &mut pixels, &open, count, None)?;
+            hidden.pass(wide, &mut pixels, quality.seed);
             open.retain(|&pixel| is_open(&pixels, pixel));
         }
         self.tally.capped += open.len() as u64;
         ControlFlow::Continue(inner.iter().map(|&pixel| pixels[pixel as usize]).collect())
     }
 
+    /// Finds what may hide in the pixels of `area`, from the first samples of `wide`.
+    fn find_hidden(
+        &mut self,
+        mut beams: Beams<'a>,
+        area: Area,
+        wide: Area,
+        pixels: &mut [Pixel],
+        hits: &[Hit],
+    ) -> ControlFlow<(), Hidden<'a>> {
+        let seed = self.settings.quality.seed;
+        let mut found = Vec::new();
+        for part in beam::blocks(area, 32) {
+            (self.on_progress)()?;
+            let look = |x: u32, y: u32| {
+                let pixel = index_of(wide, x, y);
+                let first = pixel as usize * FEWEST_FOR_ERROR as usize;
+                Look {
+                    hits: &hits[first..first + FEWEST_FOR_ERROR as usize],
+                    samples: Samples::new(FEWEST_FOR_ERROR, seed, x, y),
+                    mean: pixels[pixel as usize].mean(),
+                }
+            };
+            beams.search(part, &look, &mut |x, y, unseen| {
+                found.push((index_of(wide, x, y), FEWEST_FOR_ERROR, unseen));
+            });
+        }
+        for (pixel, count, unseen) in &found {
+            pixels[*pixel as usize].set_hidden(unseen.variance(*count));
+        }
+        ControlFlow::Continue(Hidden { beams: Some(beams), found })
+    }
+
     /// Brings the `chosen` ones among the pixels of `area`, which all have as many samples, to
-    /// `count` samples each.
+    /// `count` samples each; `hits` takes what the new camera rays meet.
     fn extend(
         &mut self,
         area: Area,
         pixels: &mut [Pixel],
         chosen: &[u32],
         count: u32,
+        mut hits: Option<&mut Vec<Hit>>,
     ) -> ControlFlow<()> {
         let seed = self.settings.quality.seed;
         let had = chosen.first().map_or(0, |&pixel| pixels[pixel as usize].count());
@@ -252,17 +297,47 @@ impl Sampler<'_> {
                 let sample = Samples::new(count, seed, x, y).sample(number);
                 CameraSample { x, y, sample, spread }
             });
-            self.batch.start(&self.view, self.settings, samples);
+            self.batch.start(self.view, self.settings, samples);
             self.tally.samples += run.end - run.start;
             self.tally.rays +=
-                self.batch.run(&self.view, &self.settings.quality, self.isa, self.on_progress)?;
+                self.batch.run(self.view, &self.settings.quality, self.isa, self.on_progress)?;
             for (index, &color) in run.zip(&self.batch.colors) {
                 pixels[pixel_of(index) as usize].add(color);
+            }
+            if let Some(hits) = &mut hits {
+                hits.extend_from_slice(&self.batch.first_hits);
             }
             let cut = self.batch.cut.iter().copied();
             self.tally.cut = cut.fold(self.tally.cut, f64::max);
         }
         ControlFlow::Continue(())
+    }
+}
+
+/// What may hide in pixels.
+#[derive(Default)]
+struct Hidden<'a> {
+    beams: Option<Beams<'a>>,
+    /// Pixels, by how many of their samples they are up to, and what none of those passed.
+    found: Vec<(u32, u32, Unseen)>,
+}
+
+impl Hidden<'_> {
+    /// Notes where the latest samples of the pixels of `area` have passed.
+    fn pass(&mut self, area: Area, pixels: &mut [Pixel], seed: u64) {
+        let Some(beams) = &self.beams else { return };
+        for (index, had, unseen) in &mut self.found {
+            let pixel = &mut pixels[*index as usize];
+            let (x, y) = (area.x0 + *index % area.width, area.y0 + *index / area.width);
+            let samples = Samples::new(pixel.count(), seed, x, y);
+            if *had == pixel.count() || unseen.is_empty() {
+                continue;
+            }
+            let places = (*had..pixel.count()).map(|number| samples.sample(number).place(x, y));
+            beams.pass(unseen, places, pixel.count());
+            *had = pixel.count();
+            pixel.set_hidden(unseen.variance(*had));
+        }
     }
 }
 
@@ -276,6 +351,11 @@ fn with_apron(area: Area, frame: Size) -> (Area, Vec<u32>) {
         .flat_map(|y| (0..area.width).map(move |x| (top + y) * width + left + x))
         .collect();
     (Area { x0, y0, width, height }, inner)
+}
+
+/// A pixel of the frame by its number in the area.
+fn index_of(area: Area, x: u32, y: u32) -> u32 {
+    (y - area.y0) * area.width + (x - area.x0)
 }
 
 /// A pixel and its neighbours, by their numbers in the area.

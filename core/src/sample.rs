@@ -56,6 +56,12 @@ impl Sample {
         self.numbers(0, self.key)
     }
 
+    /// Its place in the frame, in pixels, where the pixel is (x, y).
+    pub(crate) fn place(&self, x: u32, y: u32) -> [f64; 2] {
+        let [across, down] = self.position();
+        [f64::from(x) + across, f64::from(y) + down]
+    }
+
     /// The numbers for what a place on its way gathers. Places are told apart by `node`, and each
     /// has a sequence of its own: its first two dimensions are the best spread ones.
     pub(crate) fn gather_numbers(&self, node: u64) -> GatherNumbers {

@@ -58,6 +58,8 @@ pub(crate) struct Batch {
     next_branches: Vec<Branch>,
     gatherer: Gatherer,
     next_spreads: Vec<Spread>,
+    /// What each camera ray met.
+    pub(crate) first_hits: Vec<Hit>,
     /// What each sample sees.
     pub(crate) colors: Vec<DVec3>,
     /// Of each sample, the weights of the branches that were not traced.
@@ -156,6 +158,9 @@ impl Batch {
         while !self.rays.is_empty() {
             on_progress()?;
             trace(view, isa, &self.rays, &mut self.hits);
+            if depth == 0 {
+                self.first_hits.clone_from(&self.hits);
+            }
             ray_count += self.rays.len() as u64;
             self.points.clear();
             self.next_rays.clear();
