@@ -2,8 +2,6 @@
 //! only now and then, and where the ray meets such a face, that place is lit in its turn and gives
 //! what it can.
 
-use glam::DVec3;
-
 use crate::{
     emitter::{self, Aim, Receiver},
     isa::Isa,
