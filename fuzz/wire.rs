@@ -3,7 +3,7 @@
 
 use prost::Message;
 use rtfarm_core::{picture::PictureFormat, render::Settings, tile::Size};
-use rtfarm_proto::{LeaseName, pixels_from_bytes, pixels_to_bytes, scene_hash, wire};
+use rtfarm_proto::{LeaseName, pixels_from_bytes, pixels_to_bytes, scene_hash, transfer, wire};
 
 /// A message of the kind that the first byte says: it is refused, or written again it is read as
 /// the same, and what it means is refused or written back as it was.
@@ -119,5 +119,8 @@ fn check_order(order: wire::Order) {
     check_settings(wire::Settings { frame: order.frame, quality });
     if let Ok(known) = PictureFormat::try_from(order.format()) {
         assert_eq!(wire::Format::from(known), order.format());
+    }
+    if let Ok(known) = transfer(order.transfer) {
+        assert_eq!(wire::Transfer::from(known), order.transfer());
     }
 }

@@ -9,6 +9,7 @@ use rtfarm_core::{
     picture::PictureFormat,
     render::{DEFAULT_CUTOFF, DEFAULT_ERROR, DEFAULT_MOST_SAMPLES, Quality, Sampling},
     tile::{Size, SizeError, TileGrid},
+    transfer::Transfer,
 };
 use rtfarm_proto::Address;
 
@@ -117,8 +118,8 @@ pub(crate) struct PictureArgs {
     #[arg(long, value_name = "N", value_parser = value_parser!(u32).range(1..=65_536), conflicts_with_all = ["error", "max_samples"])]
     samples: Option<u32>,
 
-    /// Sample each pixel until its standard error is below this, where 1 is full light. Default:
-    /// 1/255, an 8-bit step.
+    /// Sample each pixel until its standard error is below this, where 1 is full light; not
+    /// encoded, whatever the --transfer. Default: 1/255, an 8-bit step.
     #[arg(long, value_name = "ERROR", default_value_t = DEFAULT_ERROR, hide_default_value = true, value_parser = parse_error)]
     error: f64,
 
@@ -146,6 +147,12 @@ pub(crate) struct PictureArgs {
     /// The side of a tile in pixels; by default the one that gives about 1000 tiles.
     #[arg(long, value_name = "N", value_parser = value_parser!(u64).range(TileGrid::SIDES))]
     tile: Option<u64>,
+
+    /// What the numbers of colours say: the light itself, or light encoded by the sRGB curve. Then
+    /// colours of materials, textures, point lights and the background are decoded, and a PNG is
+    /// encoded; an EXR holds light.
+    #[arg(long, value_name = "none|srgb", default_value = "none", value_parser = parse_transfer)]
+    transfer: Transfer,
 
     /// Bits a channel of a PNG.
     #[arg(long, value_name = "BITS", value_parser = ["8", "16"])]
@@ -321,6 +328,7 @@ impl PictureArgs {
                 cutoff: self.cutoff,
             },
             tile_side: self.tile,
+            transfer: self.transfer,
             format,
         }
     }
@@ -372,6 +380,14 @@ fn parse_error(text: &str) -> Result<f64, String> {
         Ok(error)
     } else {
         Err("an error is above 0 and at most 1".to_owned())
+    }
+}
+
+fn parse_transfer(text: &str) -> Result<Transfer, String> {
+    match text {
+        "none" => Ok(Transfer::None),
+        "srgb" => Ok(Transfer::Srgb),
+        _ => Err("a transfer is none or srgb".to_owned()),
     }
 }
 

@@ -31,8 +31,8 @@ pub(crate) fn render(
     progress: &watch::Sender<Progress>,
     stop: &CancellationToken,
 ) -> anyhow::Result<Option<(Picture, Duration)>> {
-    let Order { prepared, settings, grid, format, .. } = order;
-    let picture = new_picture(folder, settings.size, format)
+    let Order { prepared, settings, grid, transfer, format, .. } = order;
+    let picture = new_picture(folder, settings.size, format, transfer)
         .with_context(|| format!("cannot make the picture's file in {}", folder.display()))?;
     let scene = PreparedScene::open(prepared)?;
     let pool = ThreadPoolBuilder::new().num_threads(threads).build()?;

@@ -16,6 +16,7 @@ use rtfarm_core::{
     read::draw_diagnostics,
     render::{Sampling, Tally},
     tile::Size,
+    transfer::Transfer,
 };
 use rtfarm_proto::Address;
 use tempfile::TempDir;
@@ -40,6 +41,7 @@ pub(crate) struct Summary {
     pub(crate) size: Size,
     pub(crate) tally: Tally,
     pub(crate) sampling: Sampling,
+    pub(crate) transfer: Transfer,
     /// From the first lease to the last tile.
     pub(crate) rendering: Duration,
     pub(crate) workers: usize,
@@ -67,7 +69,11 @@ impl Summary {
             }
             _ => String::new(),
         };
-        format!("error {error:.2e}{capped}")
+        let unit = match self.transfer {
+            Transfer::None => "",
+            Transfer::Srgb => " in linear light",
+        };
+        format!("error {error:.2e}{unit}{capped}")
     }
 
     /// Writes the one line that a render ends with.
@@ -183,6 +189,7 @@ async fn render_here(
     stop: &CancellationToken,
 ) -> Result<Summary, Failure> {
     let (size, sampling) = (order.settings.size, order.settings.quality.sampling);
+    let transfer = order.transfer;
     let tile_count = order.grid.count();
     let progress = watch::Sender::new(Progress { tile_count, ..Progress::default() });
     let mut shown = progress.subscribe();
@@ -206,7 +213,7 @@ async fn render_here(
         return Err(Failure::Interrupted);
     };
     write_picture(output, stop, move |write| write(&picture)).await?;
-    Ok(Summary { size, tally, sampling, rendering, workers: 0 })
+    Ok(Summary { size, tally, sampling, transfer, rendering, workers: 0 })
 }
 
 async fn render_with_workers(
@@ -217,7 +224,7 @@ async fn render_with_workers(
     console: &Console,
     stop: &CancellationToken,
 ) -> Result<Summary, Failure> {
-    let sampling = order.settings.quality.sampling;
+    let (sampling, transfer) = (order.settings.quality.sampling, order.transfer);
     let folder = private_folder(&std::env::temp_dir())?;
     let socket = folder.path().join("socket");
     let listener = UnixListener::bind(&socket)
@@ -270,8 +277,8 @@ async fn render_with_workers(
     stop_serving.cancel();
     serving.await??;
     let progress = job.progress();
-    let tally = progress.borrow().tally;
-    Ok(Summary { size: job.picture().size(), tally, sampling, rendering: written?, workers })
+    let (size, tally) = (job.picture().size(), progress.borrow().tally);
+    Ok(Summary { size, tally, sampling, transfer, rendering: written?, workers })
 }
 
 /// A folder that only this user can look into; it goes when the answer does.

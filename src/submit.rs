@@ -10,7 +10,7 @@ use std::{
 };
 
 use anyhow::{Context, anyhow};
-use rtfarm_coordinator::Progress;
+use rtfarm_coordinator::{Progress, Wish};
 use rtfarm_core::{read::read_scene, tile::Size};
 use rtfarm_proto::{
     CHUNK_BYTES, MESSAGE_BYTES, PROTOCOL,
@@ -73,8 +73,9 @@ pub(crate) async fn run(
     let (event, rendering) = rendered?;
     let tally = event.tally.unwrap_or_default().try_into()?;
     let workers = event.workers as usize;
-    let sampling = args.picture.wish(output.format()).quality.sampling;
-    Summary { size, tally, sampling, rendering, workers }.tell(started, &output)?;
+    let Wish { quality, transfer, .. } = args.picture.wish(output.format());
+    let sampling = quality.sampling;
+    Summary { size, tally, sampling, transfer, rendering, workers }.tell(started, &output)?;
     Ok(())
 }
 
@@ -95,6 +96,7 @@ async fn submit(
         strict: wish.strict,
         tile_side: wish.tile_side.map_or(0, |side| side as u32),
         format: wire::Format::from(wish.format).into(),
+        transfer: wire::Transfer::from(wish.transfer).into(),
     };
     let folder = scene_folder(&args.picture.scene);
     let (text, files) = spawn_blocking(move || {

@@ -342,15 +342,19 @@ fn a_farm_over_tcp_gives_the_same_bytes() {
     let worker = ["worker", "--threads", "1", "--coordinator", url];
     let mut workers = [place.start("worker-a.log", &worker), place.start("worker-b.log", &worker)];
     for output in ["farm.png", "farm.exr"] {
-        let picture = ["--size", "103x59", "--samples", "2", "--coordinator", url];
-        let args = [&["submit", "scene.rt", "-o", output], &picture[..]].concat();
-        let mut submit = place.start("submit.log", &args);
-        assert!(submit.wait().success(), "{}", submit.log());
-        let here = place.render(
-            &format!("here-{output}"),
-            &["--size", "103x59", "--samples", "2", "--workers", "0"],
-        );
-        assert!(fs::read(place.path(output)).unwrap() == here, "{output}");
+        let pictures = ["none", "srgb"].map(|transfer| {
+            let picture = ["--size", "103x59", "--samples", "2", "--transfer", transfer];
+            let args = [&["submit", "scene.rt", "-o", output, "--coordinator", url], &picture[..]];
+            let mut submit = place.start("submit.log", &args.concat());
+            assert!(submit.wait().success(), "{}", submit.log());
+            for workers in ["0", "2"] {
+                let args = [&picture[..], &["--workers", workers]].concat();
+                let here = place.render(&format!("here-{output}"), &args);
+                assert!(fs::read(place.path(output)).unwrap() == here, "{output} {args:?}");
+            }
+            fs::read(place.path(output)).unwrap()
+        });
+        assert!(pictures[0] != pictures[1], "{output}");
     }
 
     let other = ["worker", "--coordinator", url, "--claim-version", "0.0.0"];

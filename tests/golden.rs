@@ -21,6 +21,7 @@ use rtfarm_core::{
     read::read_scene,
     render::{Quality, Sampling, Settings, render_tile},
     tile::{Area, Size},
+    transfer::Transfer,
 };
 
 type Image = ImageBuffer<Rgb<u16>, Vec<u16>>;
@@ -69,7 +70,7 @@ fn render(name: &str) -> Vec<u8> {
         assert_eq!(tile.tally.rays, other.tally.rays, "{name}: {isa}");
     }
     let file = tempfile::tempfile().unwrap();
-    let picture = Picture::new(file, size, PictureFormat::Png16).unwrap();
+    let picture = Picture::new(file, size, PictureFormat::Png16, Transfer::None).unwrap();
     picture.put(area, &tile.pixels).unwrap();
     let mut png = Cursor::new(Vec::new());
     picture.encode(&mut png).unwrap();

@@ -4,10 +4,11 @@ use rtfarm_core::{
     picture::PictureFormat,
     prepare::{PrepareError, prepare},
     prepared::PreparedBytes,
-    read::{Diagnostic, Omitted, Reading, Resolve, read_scene},
+    read::{Diagnostic, Omitted, Reading, Resolve, read_scene_with},
     render::{Quality, Settings},
     scene::Scene,
     tile::{Size, TileGrid},
+    transfer::Transfer,
 };
 
 /// The most tiles that a picture may be cut into; each costs the coordinator some 100 bytes.
@@ -26,6 +27,8 @@ pub struct Wish {
     pub quality: Quality,
     /// The side of a tile in pixels; chosen by the frame's size when missing.
     pub tile_side: Option<u64>,
+    /// What the numbers of colours say of light, in the scene and in a PNG.
+    pub transfer: Transfer,
     /// How the picture is written.
     pub format: PictureFormat,
 }
@@ -41,6 +44,8 @@ pub struct Order {
     pub settings: Settings,
     /// The frame and its tiles.
     pub grid: TileGrid,
+    /// What the numbers of colours said of light in the scene, and are to say in a PNG.
+    pub transfer: Transfer,
     /// How the picture is written.
     pub format: PictureFormat,
 }
@@ -68,7 +73,7 @@ pub enum Refusal {
 impl Wish {
     /// Reads and prepares the scene. This takes long: never call it on the async runtime.
     pub fn place(self, text: &[u8], resolve: &Resolve<'_>) -> Placed {
-        let reading = read_scene(text, resolve);
+        let reading = read_scene_with(text, resolve, self.transfer);
         let reading = if self.strict { reading.into_strict() } else { reading };
         let Reading { scene, diagnostics, omitted } = reading;
         let order = match &scene {
@@ -96,8 +101,8 @@ impl Wish {
             )));
         }
         let prepared = prepare(scene).map_err(|error| other(error.to_string()))?;
-        let Self { name, quality, format, .. } = self;
+        let Self { name, quality, transfer, format, .. } = self;
         let settings = Settings { size, quality };
-        Ok(Order { name, prepared, settings, grid, format })
+        Ok(Order { name, prepared, settings, grid, transfer, format })
     }
 }

@@ -108,11 +108,11 @@ impl Coordinator {
     /// Takes an order. This writes files: never call it on the async runtime.
     pub fn submit(&self, order: Order) -> Result<Arc<Job>, SubmitError> {
         let Config { scene_folder, picture_folder, .. } = &self.shared.config;
-        let Order { name, prepared, settings, grid, format } = order;
+        let Order { name, prepared, settings, grid, transfer, format } = order;
         let scene = SceneFile::write(scene_folder, &prepared)
             .map_err(|error| SubmitError::Scene(scene_folder.clone(), error))?;
         drop(prepared);
-        let picture = new_picture(picture_folder, settings.size, format)
+        let picture = new_picture(picture_folder, settings.size, format, transfer)
             .map_err(|error| SubmitError::Picture(picture_folder.clone(), error))?;
 
         let id = self.shared.jobs().number_job();
@@ -126,6 +126,7 @@ impl Coordinator {
             scene = job.name,
             size = %settings.size,
             sampling = ?settings.quality.sampling,
+            ?transfer,
             tiles = grid.count(),
             side = grid.side(),
             scene_bytes = job.scene.byte_count(),

@@ -16,7 +16,7 @@ use rtfarm_core::{
 };
 use rtfarm_proto::{
     CHUNK_BYTES, JobId, LONGEST_WAIT, LeaseName, MESSAGE_BYTES, PROTOCOL, WireError, WorkerId,
-    pixels_from_bytes, scene_hash,
+    pixels_from_bytes, scene_hash, transfer,
     wire::{
         self, event, farm_server, jobs_server, lease_response, submit_request, submit_response,
     },
@@ -423,10 +423,11 @@ async fn receive(mut parts: Streaming<wire::SubmitRequest>) -> Result<Bundle, St
 fn to_wish(order: wire::Order) -> Result<Wish, WireError> {
     let format = order.format().try_into()?;
     let size = order.frame.map(Size::try_from).transpose()?;
+    let transfer = transfer(order.transfer)?;
     let quality = order.quality.ok_or(WireError::Missing("quality"))?.try_into()?;
     let wire::Order { name, strict, tile_side, .. } = order;
     let tile_side = (tile_side > 0).then_some(tile_side.into());
-    Ok(Wish { name, strict, size, quality, tile_side, format })
+    Ok(Wish { name, strict, size, quality, tile_side, transfer, format })
 }
 
 fn to_event(progress: &Progress) -> wire::Event {

@@ -11,6 +11,7 @@ use rtfarm_core::{
     picture::{Picture, PictureFormat},
     prepared::{PreparedBytes, SceneHash},
     tile::Size,
+    transfer::Transfer,
 };
 use rustix::{
     fs::{FallocateFlags, fallocate},
@@ -52,7 +53,12 @@ impl SceneFile {
 
 /// Makes a black picture in a file of `folder` that has no name, so that nothing stays behind
 /// however the process ends. Its bytes are reserved: a full disk is an error now, not later.
-pub fn new_picture(folder: &Path, size: Size, format: PictureFormat) -> io::Result<Picture> {
+pub fn new_picture(
+    folder: &Path,
+    size: Size,
+    format: PictureFormat,
+    transfer: Transfer,
+) -> io::Result<Picture> {
     let file: File = tempfile::tempfile_in(folder)?;
     let byte_count = Picture::byte_count(size, format);
     loop {
@@ -62,7 +68,7 @@ pub fn new_picture(folder: &Path, size: Size, format: PictureFormat) -> io::Resu
             Err(error) => return Err(error.into()),
         }
     }
-    Picture::new(file, size, format)
+    Picture::new(file, size, format, transfer)
 }
 
 /// The folder in which a file of that path stands.

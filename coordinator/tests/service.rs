@@ -56,6 +56,7 @@ impl Farm {
             quality: Some(Quality { sampling: Sampling::Fixed(1), ..Quality::default() }.into()),
             tile_side: 8,
             format: wire::Format::Png8.into(),
+            transfer: wire::Transfer::None.into(),
             ..wire::Order::default()
         };
         let parts = [Part::Order(order), Part::Text(SCENE.into())]

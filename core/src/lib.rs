@@ -4,6 +4,7 @@
 //! Nothing here opens files, reads a clock, uses sockets or starts threads other than rayon's.
 
 pub mod scene;
+pub mod transfer;
 
 // Text into a scene.
 mod block;

@@ -18,7 +18,10 @@ use exr::{
 };
 use rayon::prelude::*;
 
-use crate::tile::{Area, Size};
+use crate::{
+    tile::{Area, Size},
+    transfer::Transfer,
+};
 
 /// How a picture is written. All light is on channels where 1.0 stands for 255 in a scene.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
@@ -42,21 +45,24 @@ impl PictureFormat {
     }
 
     /// Appends a pixel as the picture's file holds it.
-    fn append(self, bytes: &mut Vec<u8>, pixel: [f32; 3]) {
+    fn append(self, bytes: &mut Vec<u8>, pixel: [f32; 3], transfer: Transfer) {
         for channel in pixel {
             match self {
-                Self::Png8 => bytes.push(quantize(channel, 255.0) as u8),
+                Self::Png8 => bytes.push(quantize(channel, transfer, 255.0) as u8),
                 // PNG has the high byte first.
-                Self::Png16 => bytes.extend((quantize(channel, 65_535.0) as u16).to_be_bytes()),
+                Self::Png16 => {
+                    let step = quantize(channel, transfer, 65_535.0) as u16;
+                    bytes.extend(step.to_be_bytes());
+                }
                 Self::ExrF32 => bytes.extend(channel.to_ne_bytes()),
             }
         }
     }
 }
 
-/// Clamps to `0..=1` and rounds to the nearest step, halves upwards.
-fn quantize(channel: f32, steps: f64) -> f64 {
-    (f64::from(channel).clamp(0.0, 1.0) * steps + 0.5).floor()
+/// Clamps to `0..=1`, encodes and rounds to the nearest step, halves upwards.
+fn quantize(channel: f32, transfer: Transfer, steps: f64) -> f64 {
+    (transfer.encode(f64::from(channel).clamp(0.0, 1.0)) * steps + 0.5).floor()
 }
 
 /// Why a tile cannot be put into a picture.
@@ -90,13 +96,20 @@ pub struct Picture {
     file: File,
     size: Size,
     format: PictureFormat,
+    transfer: Transfer,
 }
 
 impl Picture {
-    /// Makes `file`, which must be empty and open for reading and writing, a black picture.
-    pub fn new(file: File, size: Size, format: PictureFormat) -> io::Result<Self> {
+    /// Makes `file`, which must be empty and open for reading and writing, a black picture. As a
+    /// PNG it is encoded by `transfer`.
+    pub fn new(
+        file: File,
+        size: Size,
+        format: PictureFormat,
+        transfer: Transfer,
+    ) -> io::Result<Self> {
         file.set_len(Self::byte_count(size, format))?;
-        Ok(Self { file, size, format })
+        Ok(Self { file, size, format, transfer })
     }
 
     /// Bytes that the file of such a picture takes.
@@ -123,7 +136,7 @@ impl Picture {
         for (y, row) in (area.y0..).zip(pixels.chunks_exact(area.width as usize)) {
             bytes.clear();
             for &pixel in row {
-                self.format.append(&mut bytes, pixel);
+                self.format.append(&mut bytes, pixel, self.transfer);
             }
             self.file.write_all_at(&bytes, self.offset(area.x0, y))?;
         }
@@ -146,6 +159,9 @@ impl Picture {
         encoder.set_color(png::ColorType::Rgb);
         encoder.set_depth(depth);
         encoder.set_compression(png::Compression::Fast);
+        if self.transfer == Transfer::Srgb {
+            encoder.set_source_srgb(png::SrgbRenderingIntent::Perceptual);
+        }
         let mut writer = encoder.write_header()?;
         let mut stream = writer.stream_writer_with_size(CHUNK_BYTES)?;
         for y in 0..self.size.height() {
@@ -247,12 +263,12 @@ mod tests {
     /// A picture put tile by tile and encoded, read back by another reader of the format.
     fn round_trip(
         size: (u64, u64),
-        format: PictureFormat,
+        (format, transfer): (PictureFormat, Transfer),
         pixel: impl Fn(u32, u32) -> [f32; 3],
     ) -> image::DynamicImage {
         let size = Size::new(size.0, size.1).unwrap();
         let grid = TileGrid::new(size, 16).unwrap();
-        let picture = Picture::new(tempfile::tempfile().unwrap(), size, format).unwrap();
+        let picture = Picture::new(tempfile::tempfile().unwrap(), size, format, transfer).unwrap();
         for tile in grid.render_order() {
             let area = grid.area(tile);
             let pixels: Vec<[f32; 3]> = (area.y0..area.y0 + area.height)
@@ -277,7 +293,7 @@ mod tests {
 
     #[test]
     fn eight_bits_are_rounded_once() {
-        let image = round_trip((101, 67), PictureFormat::Png8, ramp).into_rgb8();
+        let image = round_trip((101, 67), (PictureFormat::Png8, Transfer::None), ramp).into_rgb8();
         assert_eq!(image.dimensions(), (101, 67));
         for (x, y, pixel) in image.enumerate_pixels() {
             let expected = ramp(x, y).map(|c| (f64::from(c).min(1.0) * 255.0).round() as u8);
@@ -287,7 +303,7 @@ mod tests {
 
     #[test]
     fn sixteen_bits_are_rounded_once() {
-        let image = round_trip((33, 19), PictureFormat::Png16, ramp).into_rgb16();
+        let image = round_trip((33, 19), (PictureFormat::Png16, Transfer::None), ramp).into_rgb16();
         for (x, y, pixel) in image.enumerate_pixels() {
             let expected = ramp(x, y).map(|c| (f64::from(c).min(1.0) * 65_535.0).round() as u16);
             assert_eq!(pixel.0, expected, "({x}, {y})");
@@ -298,7 +314,8 @@ mod tests {
     fn floats_are_kept_bit_for_bit() {
         let wild = |x: u32, y: u32| [x as f32 * 1e30, -(y as f32), 1e-40];
         for size in [(1, 1), (101, 67), (17, 300), (300, 16)] {
-            let image = round_trip(size, PictureFormat::ExrF32, wild).into_rgb32f();
+            let image =
+                round_trip(size, (PictureFormat::ExrF32, Transfer::None), wild).into_rgb32f();
             assert_eq!(image.dimensions(), (size.0 as u32, size.1 as u32));
             for (x, y, pixel) in image.enumerate_pixels() {
                 assert_eq!(pixel.0.map(f32::to_bits), wild(x, y).map(f32::to_bits), "({x}, {y})");
@@ -309,15 +326,67 @@ mod tests {
     #[test]
     fn png_is_clamped_to_its_range() {
         let wild = |_, _| [-3.0, f32::INFINITY, 1.0001];
-        let image = round_trip((5, 3), PictureFormat::Png8, wild).into_rgb8();
+        let image = round_trip((5, 3), (PictureFormat::Png8, Transfer::None), wild).into_rgb8();
         assert!(image.pixels().all(|pixel| pixel.0 == [0, 255, 255]));
+    }
+
+    #[test]
+    fn encoding_gives_the_nearest_step() {
+        for steps in [255.0, 65_535.0] {
+            let count = steps as u32;
+            for step in 0..count {
+                let (below, above) = (f64::from(step), f64::from(step + 1));
+                let found = |light: f32| quantize(light, Transfer::Srgb, steps);
+                assert_eq!(found(Transfer::Srgb.decode(below / steps) as f32), below);
+                // The numbers next to where the curve is half-way between two steps.
+                let number = (below + 0.5) / steps;
+                let middle = if number <= 0.040_45 {
+                    number / 12.92
+                } else {
+                    libm::pow((number + 0.055) / 1.055, 2.4)
+                };
+                let nearest = middle as f32;
+                let is_above = f64::from(nearest) > middle;
+                let (low, high) = if is_above {
+                    (nearest.next_down(), nearest)
+                } else {
+                    (nearest, nearest.next_up())
+                };
+                assert_eq!((found(low), found(high)), (below, above), "{step} of {count}");
+            }
+            assert_eq!(quantize(1.0, Transfer::Srgb, steps), steps);
+        }
+    }
+
+    #[test]
+    fn an_encoded_png_says_so_and_an_exr_stays_light() {
+        let srgb = |format| {
+            let size = Size::new(1, 1).unwrap();
+            let file = tempfile::tempfile().unwrap();
+            let picture = Picture::new(file, size, format, Transfer::Srgb).unwrap();
+            let area = Area { x0: 0, y0: 0, width: 1, height: 1 };
+            picture.put(area, &[[0.5, 7.0, -1.0]]).unwrap();
+            let mut out = Cursor::new(Vec::new());
+            picture.encode(&mut out).unwrap();
+            out.into_inner()
+        };
+        for format in [PictureFormat::Png8, PictureFormat::Png16] {
+            let file = srgb(format);
+            let reader = png::Decoder::new(Cursor::new(&file)).read_info().unwrap();
+            assert_eq!(reader.info().srgb, Some(png::SrgbRenderingIntent::Perceptual));
+            // 188 of 255 is half the light of white.
+            let image = image::load_from_memory(&file).unwrap();
+            assert_eq!(image.into_rgb8().get_pixel(0, 0).0, [188, 255, 0]);
+        }
+        let image = image::load_from_memory(&srgb(PictureFormat::ExrF32)).unwrap();
+        assert_eq!(image.into_rgb32f().get_pixel(0, 0).0, [0.5, 7.0, -1.0]);
     }
 
     #[test]
     fn what_is_no_number_or_has_a_wrong_length_is_refused() {
         let size = Size::new(4, 4).unwrap();
-        let picture =
-            Picture::new(tempfile::tempfile().unwrap(), size, PictureFormat::Png8).unwrap();
+        let file = tempfile::tempfile().unwrap();
+        let picture = Picture::new(file, size, PictureFormat::Png8, Transfer::None).unwrap();
         let area = Area { x0: 1, y0: 2, width: 2, height: 1 };
         let error = picture.put(area, &[[0.0; 3], [0.0, f32::NAN, 0.0]]).unwrap_err();
         assert_eq!(error.to_string(), "the pixel (2, 2) is not a number");

@@ -22,6 +22,7 @@ use crate::{
     scene::{self, Material, Mesh, MeshVertices, Operation, Parallelepiped, Scene, SolidNode},
     solid::{self, NodeRecord},
     texcoord::Texcoords,
+    transfer::Transfer,
     triangle::triangle_normal,
     weld::weld,
 };
@@ -170,7 +171,7 @@ impl Images {
         }
         faces.par_sort_unstable_by_key(|face| face.rank);
 
-        let mut pyramids = Pyramids::default();
+        let mut pyramids = Pyramids { transfer: scene.transfer, ..Pyramids::default() };
         let mut numbers = vec![None; scene.textures.len()];
         let of_materials = (scene.materials.iter().zip(is_worn))
             .map(|(material, is_worn)| match material.texture {
@@ -220,6 +221,8 @@ fn features(scene: &Scene, images: &Images) -> Features {
         has_solids: u32::from(!scene.solids.is_empty()),
         has_emitters: 0,
         has_textures: u32::from(!images.faces.is_empty()),
+        has_srgb_texels: u32::from(!images.faces.is_empty() && scene.transfer == Transfer::Srgb),
+        padding: 0,
     }
 }
 

@@ -19,12 +19,13 @@ use crate::{
     solid::{self, NodeRecord},
     texcoord::Texcoords,
     texture_sampling::TextureView,
+    transfer::Transfer,
 };
 
 const MAGIC: [u8; 8] = *b"rtfarm\r\n";
 
 /// Changes with the layout or the meaning of any byte.
-const VERSION: u32 = 5;
+const VERSION: u32 = 6;
 
 /// Reads differently on a machine of the other byte order.
 const BYTE_ORDER: u32 = 0x0102_0304;
@@ -86,6 +87,9 @@ pub(crate) struct Features {
     pub(crate) has_emitters: u32,
     /// A face shows an image.
     pub(crate) has_textures: u32,
+    /// The images' finest levels are encoded by the sRGB curve.
+    pub(crate) has_srgb_texels: u32,
+    pub(crate) padding: u32,
 }
 
 impl Features {
@@ -108,6 +112,10 @@ impl Features {
 
     pub(crate) fn has_textures(&self) -> bool {
         self.has_textures == 1 && !left_out::TEXTURE
+    }
+
+    fn texel_transfer(&self) -> Transfer {
+        if self.has_srgb_texels == 1 { Transfer::Srgb } else { Transfer::None }
     }
 }
 
@@ -564,6 +572,7 @@ impl<'a> View<'a> {
         TextureView {
             levels: &self.texture_levels[self.textures[index as usize].levels()],
             fine: self.fine_texels,
+            light_of_bytes: self.header.features.texel_transfer().light_of_bytes(),
             coarse: self.coarse_texels,
         }
     }

@@ -6,7 +6,7 @@ use std::ops::Range;
 
 use rayon::prelude::*;
 
-use crate::scene::Texture;
+use crate::{scene::Texture, transfer::Transfer};
 
 /// An image: a run of levels.
 #[derive(Debug, Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
@@ -46,11 +46,13 @@ impl LevelRecord {
 /// Images with all their levels, `[y][x]` each.
 #[derive(Debug, Default)]
 pub(crate) struct Pyramids {
+    /// Of the images' texels.
+    pub(crate) transfer: Transfer,
     pub(crate) textures: Vec<TextureRecord>,
     pub(crate) levels: Vec<LevelRecord>,
-    /// Of the images themselves: red, green, blue in 255ths, and 0.
+    /// Of the images themselves: red, green, blue as their files have them, and 0.
     pub(crate) fine: Vec<[u8; 4]>,
-    /// Of all other levels: red, green, blue.
+    /// Of all other levels: red, green, blue light.
     pub(crate) coarse: Vec<[f32; 3]>,
 }
 
@@ -61,12 +63,13 @@ impl Pyramids {
         let first_level = self.levels.len() as u32;
         self.levels.push(LevelRecord { width, height, offset: self.fine.len() as u64 });
         self.fine.par_extend(texture.texels.par_iter().map(|&[r, g, b]| [r, g, b, 0]));
+        let light = self.transfer.light_of_bytes();
         let mut last_start = None;
         while width > 1 || height > 1 {
             let texels = match last_start {
                 None => half_size(width, height, |x, y| {
                     let texel = texture.texels[y as usize * texture.width as usize + x as usize];
-                    texel.map(|channel| f64::from(channel) / 255.0)
+                    texel.map(|channel| light[usize::from(channel)] / 255.0)
                 }),
                 Some(start) => {
                     let finer: &[[f32; 3]] = &self.coarse[start..];
@@ -158,6 +161,24 @@ mod tests {
         }
         eprintln!("means are kept to {worst:.1e}");
         assert!(worst < 1e-6);
+    }
+
+    #[test]
+    fn coarser_levels_are_means_of_light() {
+        let texels = vec![[0, 255, 10], [255, 255, 200]];
+        let texture = Texture { path: String::new(), width: 2, height: 1, texels };
+        let coarse = |transfer: Transfer| {
+            let mut pyramids = Pyramids { transfer, ..Pyramids::default() };
+            pyramids.add(&texture);
+            assert_eq!(pyramids.fine, [[0, 255, 10, 0], [255, 255, 200, 0]]);
+            pyramids.coarse
+        };
+        assert_eq!(coarse(Transfer::None), [[0.5, 1.0, (210.0 / 510.0) as f32]]);
+        let blue = [10.0, 200.0].map(|byte| Transfer::Srgb.decode(byte / 255.0));
+        let mean = f64::midpoint(blue[0], blue[1]) as f32;
+        let found = coarse(Transfer::Srgb);
+        assert_eq!(found[0][..2], [0.5, 1.0]);
+        assert!((found[0][2] - mean).abs() < 1e-7, "{found:?}");
     }
 
     #[test]

@@ -21,6 +21,7 @@ use crate::{
     symbol::Symbols,
     texture,
     tile::Size,
+    transfer::Transfer,
     triangles::{self, Triangles},
 };
 
@@ -66,17 +67,28 @@ impl Reading {
 /// );
 /// ```
 pub fn read_scene(text: &[u8], resolve: &Resolve<'_>) -> Reading {
-    read_scene_in_pieces(text, resolve, triangles::PIECE)
+    read_scene_with(text, resolve, Transfer::None)
+}
+
+/// Reads a scene whose colours are encoded: those of materials, textures, point lights and the
+/// background. `ambient` is an amount of light.
+pub fn read_scene_with(text: &[u8], resolve: &Resolve<'_>, transfer: Transfer) -> Reading {
+    read_scene_in_pieces(text, resolve, transfer, triangles::PIECE)
 }
 
 /// Reads a scene whose triangles are parsed in parallel by pieces of about so many bytes.
-pub(crate) fn read_scene_in_pieces(text: &[u8], resolve: &Resolve<'_>, piece: usize) -> Reading {
-    let mut reader = Reader::new(text, piece, &[]);
+pub(crate) fn read_scene_in_pieces(
+    text: &[u8],
+    resolve: &Resolve<'_>,
+    transfer: Transfer,
+    piece: usize,
+) -> Reading {
+    let mut reader = Reader::new(text, transfer, piece, &[]);
     reader.read_file();
     let surprising = reader.symbols.textured_after_use();
     if !surprising.is_empty() {
         // Copies were judged as if these materials had no texture. Once more, knowing better.
-        reader = Reader::new(text, piece, &surprising);
+        reader = Reader::new(text, transfer, piece, &surprising);
         reader.read_file();
     }
     reader.finish(resolve)
@@ -119,7 +131,7 @@ struct PointLight<'t> {
 }
 
 impl<'t> Reader<'t> {
-    fn new(text: &'t [u8], piece: usize, textured: &[Vec<u8>]) -> Self {
+    fn new(text: &'t [u8], transfer: Transfer, piece: usize, textured: &[Vec<u8>]) -> Self {
         let mut report = Report::default();
         let is_text = check_encoding(text, &mut report);
         Self {
@@ -129,7 +141,7 @@ impl<'t> Reader<'t> {
             blocks: Blocks::new(text, report),
             symbols: Symbols::new(textured),
             triangles: Triangles::new(),
-            scene: Scene::default(),
+            scene: Scene { transfer, ..Scene::default() },
             primitive: 0,
             viewport: None,
             width: Field::default(),
@@ -222,7 +234,7 @@ impl<'t> Reader<'t> {
                 if !is_at_home {
                     self.warn_synonym(word, "`background` in `viewport`");
                 }
-                let color = self.color(word);
+                let color = self.encoded_color(word);
                 self.background.set(&mut self.blocks.report, word, color);
             }
             b"size" if is_at_home => self.read_size(word),
@@ -284,6 +296,20 @@ impl<'t> Reader<'t> {
             });
         }
         is_color.then_some(color / 255.0)
+    }
+
+    /// The light of such a colour.
+    fn encoded_color(&mut self, word: Word<'t>) -> Option<DVec3> {
+        let color = self.color(word)?;
+        let light = self.decode(color);
+        if !light.is_finite() {
+            self.refuse_value(|| "this colour is too bright to be computed with".into());
+        }
+        light.is_finite().then_some(light)
+    }
+
+    fn decode(&self, color: DVec3) -> DVec3 {
+        DVec3::from(color.to_array().map(|number| self.scene.transfer.decode(number)))
     }
 
     pub(crate) fn warn_synonym(&mut self, word: Word<'t>, instead: &str) {
@@ -381,7 +407,7 @@ impl<'t> Reader<'t> {
                 format!("the parts of a colour are from 0 to 255; taken as {r} {g} {b}")
             });
         }
-        DVec3::from(clamped) / 255.0
+        self.decode(DVec3::from(clamped) / 255.0)
     }
 
     fn clamp_alpha(&mut self, alpha: f64) -> f64 {
@@ -513,7 +539,7 @@ impl<'t> Reader<'t> {
                     power.set(&mut self.blocks.report, word, value);
                 }
                 b"color" => {
-                    let value = self.color(word);
+                    let value = self.encoded_color(word);
                     color.set(&mut self.blocks.report, word, value);
                 }
                 _ => self.blocks.skip_unknown_keyword(word),

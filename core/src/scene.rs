@@ -6,9 +6,9 @@ use std::{fmt, sync::Arc};
 
 use glam::{DVec2, DVec3};
 
-use crate::tile::Size;
+use crate::{tile::Size, transfer::Transfer};
 
-/// A whole scene. Colours are linear red, green and blue, 1.0 where the file says 255.
+/// A whole scene. Colours are red, green and blue light, 1.0 where the file says 255.
 #[derive(Debug, Clone, Default)]
 pub struct Scene {
     /// Eye and screen; a scene without them can be checked but not rendered.
@@ -25,6 +25,8 @@ pub struct Scene {
     pub materials: Vec<Material>,
     /// The images that materials name.
     pub textures: Vec<Texture>,
+    /// How their texels become light; all other colours are light already.
+    pub transfer: Transfer,
     /// Spheres in file order.
     pub spheres: Vec<Sphere>,
     /// Triangles in file order.
@@ -146,7 +148,7 @@ pub struct Texture {
     pub width: u32,
     /// Rows of texels, at least 1.
     pub height: u32,
-    /// Red, green, blue, `[y][x]`, the top row first.
+    /// Red, green, blue as the file has them, `[y][x]`, the top row first.
     pub texels: Vec<[u8; 3]>,
 }
 

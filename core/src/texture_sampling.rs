@@ -67,6 +67,8 @@ pub(crate) fn texture_color(
 pub(crate) struct TextureView<'a> {
     pub(crate) levels: &'a [LevelRecord],
     pub(crate) fine: &'a [[u8; 4]],
+    /// What their bytes stand for, in 255ths.
+    pub(crate) light_of_bytes: &'a [f64; 256],
     pub(crate) coarse: &'a [[f32; 3]],
 }
 
@@ -158,7 +160,8 @@ impl TextureView<'_> {
     fn texel(&self, level: usize, index: usize) -> DVec3 {
         if level == 0 {
             let [r, g, b, _] = self.fine[index];
-            DVec3::new(r.into(), g.into(), b.into())
+            let light = |byte: u8| self.light_of_bytes[usize::from(byte)];
+            DVec3::new(light(r), light(g), light(b))
         } else {
             DVec3::from_array(self.coarse[index].map(f64::from))
         }
@@ -193,7 +196,12 @@ mod tests {
     }
 
     fn look(pyramids: &Pyramids) -> TextureView<'_> {
-        TextureView { levels: &pyramids.levels, fine: &pyramids.fine, coarse: &pyramids.coarse }
+        TextureView {
+            levels: &pyramids.levels,
+            fine: &pyramids.fine,
+            light_of_bytes: pyramids.transfer.light_of_bytes(),
+            coarse: &pyramids.coarse,
+        }
     }
 
     fn noise(x: u32, y: u32) -> [u8; 3] {

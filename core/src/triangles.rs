@@ -417,7 +417,10 @@ fn hash_vertices(vertices: &[DVec3; 3], key: u64) -> u64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::read::{Reading, read_scene_in_pieces};
+    use crate::{
+        read::{Reading, read_scene_in_pieces},
+        transfer::Transfer,
+    };
 
     /// Reads with pieces of a few bytes on two threads, with whole pieces on one thread, and
     /// compares.
@@ -428,6 +431,7 @@ mod tests {
                 read_scene_in_pieces(
                     text.as_bytes(),
                     &|_| Err(std::io::ErrorKind::NotFound.into()),
+                    Transfer::None,
                     piece,
                 )
             })

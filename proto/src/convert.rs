@@ -6,6 +6,7 @@ use rtfarm_core::{
     prepared::SceneHash,
     render::{Quality, Sampling, Settings, Tally},
     tile::{Size, SizeError},
+    transfer::Transfer,
 };
 
 use crate::wire;
@@ -31,6 +32,9 @@ pub enum WireError {
     /// A number is out of its range.
     #[error("a cut-off of {0} is out of range")]
     Cutoff(f64),
+    /// There is no such transfer curve.
+    #[error("no transfer curve has the number {0}")]
+    Transfer(i32),
     /// What a tile is said to have taken is impossible.
     #[error("a tally out of range")]
     Tally,
@@ -154,6 +158,25 @@ impl From<PictureFormat> for wire::Format {
     }
 }
 
+impl From<Transfer> for wire::Transfer {
+    fn from(transfer: Transfer) -> Self {
+        match transfer {
+            Transfer::None => Self::None,
+            Transfer::Srgb => Self::Srgb,
+        }
+    }
+}
+
+/// Reads a transfer curve's number.
+pub fn transfer(number: i32) -> Result<Transfer, WireError> {
+    match wire::Transfer::try_from(number) {
+        Ok(wire::Transfer::None) => Ok(Transfer::None),
+        Ok(wire::Transfer::Srgb) => Ok(Transfer::Srgb),
+        Ok(wire::Transfer::Unspecified) => Err(WireError::Missing("transfer curve")),
+        Err(_) => Err(WireError::Transfer(number)),
+    }
+}
+
 /// Reads a scene's hash.
 pub fn scene_hash(bytes: &[u8]) -> Result<SceneHash, WireError> {
     bytes.try_into().map(SceneHash).map_err(|_| WireError::HashLength(bytes.len()))
@@ -196,6 +219,17 @@ mod tests {
                 Err(WireError::PixelLength(length)),
                 "{length} bytes"
             );
+        }
+    }
+
+    #[test]
+    fn unknown_transfer_curves_are_refused() {
+        for known in [Transfer::None, Transfer::Srgb] {
+            assert_eq!(transfer(wire::Transfer::from(known).into()), Ok(known));
+        }
+        assert_eq!(transfer(0), Err(WireError::Missing("transfer curve")));
+        for number in [-1, 3, i32::MAX] {
+            assert_eq!(transfer(number), Err(WireError::Transfer(number)));
         }
     }
 

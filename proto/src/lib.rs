@@ -7,7 +7,7 @@ mod convert;
 mod name;
 
 pub use address::{Address, AddressError};
-pub use convert::{WireError, pixels_from_bytes, pixels_to_bytes, scene_hash};
+pub use convert::{WireError, pixels_from_bytes, pixels_to_bytes, scene_hash, transfer};
 pub use name::{Epoch, JobId, LeaseName, WorkerId};
 
 /// The generated messages, clients and servers.
@@ -22,7 +22,7 @@ pub mod wire {
 }
 
 /// The version of `farm.proto`. Both sides must have the same, and the same package version.
-pub const PROTOCOL: u32 = 2;
+pub const PROTOCOL: u32 = 3;
 
 /// The largest message that either side takes: a tile of the largest side, 12 bytes a pixel, and
 /// room for what stands around it.
