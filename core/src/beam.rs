@@ -27,11 +27,12 @@ const BLOCKS: [(u32, usize); 3] = [(8, 128), (2, 64), (1, MOST_FACES)];
 /// Faces that a pixel is searched for.
 const MOST_FACES: usize = 128;
 
-/// What stands so many pixels' widths before all that the samples of a crowded pixel met is
-/// searched for even there.
+/// In a crowded pixel only what stands so many pixels' widths before all that the samples met is
+/// searched for.
 const BEFORE: f64 = 8.0;
 
-/// A face counts in a pixel up to this many times as far as the pixel's samples met something.
+/// A face counts in a pixel if it begins at most this many times as far away as what the pixel's
+/// samples met.
 const BEYOND: f64 = 1.25;
 
 /// Of a picture's error: what a face may add unseen without being noted, and what all faces of a
@@ -39,8 +40,9 @@ const BEYOND: f64 = 1.25;
 const NEGLIGIBLE: f64 = 1.0 / 64.0;
 const NEGLIGIBLE_SUM: f64 = 1.0 / 8.0;
 
-/// A sphere that is larger on the screen, in pixels, is found by the samples of some pixel.
-const LARGEST_SPHERE: f64 = 2.0;
+/// A sphere with a larger radius on the screen, in pixels, is met by the samples of its pixels or
+/// their neighbours.
+const LARGEST_SPHERE: f64 = 1.0;
 
 /// Of the depth of its farthest corner: a face is cut off nearer to the eye than this.
 const NEAR: f64 = 1.0 / (1 << 30) as f64;
@@ -306,8 +308,11 @@ impl<'a> Beams<'a> {
                 }
             }
             while mask != 0 {
-                self.waiting.push(node.children[mask.trailing_zeros() as usize & 7]);
+                let child = node.children[mask.trailing_zeros() as usize & 7];
                 mask &= mask - 1;
+                if child != Child::NONE {
+                    self.waiting.push(child);
+                }
             }
         }
         true
@@ -403,8 +408,11 @@ impl<'a> Beams<'a> {
             let straight = u + face % 2;
             let corners = [(turned, v), (straight, v), (straight, v + 1), (turned, v + 1)]
                 .map(|(u, v)| corner(face, u, v));
-            let face = face as u32;
-            self.gather_polygon((item, part + face, rank + face), &corners, block, deepest);
+            // Planes that are as good as parallel meet nowhere.
+            if corners.iter().all(|corner| corner.is_finite()) {
+                let face = face as u32;
+                self.gather_polygon((item, part + face, rank + face), &corners, block, deepest);
+            }
         }
     }
 
@@ -649,8 +657,8 @@ impl<'a> Beams<'a> {
         }
     }
 
-    /// How far the colour of a face that nobody has seen may lie from `mean`, in a scene whose
-    /// light is about 1.
+    /// How far the colour of a face that nobody has seen may lie from `mean`, where no more light
+    /// than 1 falls on it.
     fn contrast(&self, material: u32, mean: DVec3) -> DVec3 {
         let material = &self.view.materials[material as usize];
         let Shares { own, other } = shares(material);
@@ -723,7 +731,7 @@ struct Side {
 }
 
 impl Side {
-    /// Which of a node's boxes reach inside, a bit each; boxes of unused children never do.
+    /// Which of a node's boxes reach inside, a bit each.
     fn touched(&self, planes: &[[f32; 8]; 6]) -> u32 {
         let normal = self.normal.to_array();
         let mut highest = [0.0; 8];
@@ -827,4 +835,126 @@ fn power(base: f64, exponent: u32) -> f64 {
         left >>= 1;
     }
     product
+}
+
+#[cfg(test)]
+mod tests {
+    use std::fmt::Write;
+
+    use super::*;
+    use crate::{
+        prepare::prepare,
+        prepared::{PreparedBytes, PreparedScene},
+        read::read_scene,
+    };
+
+    /// Triangles, quadrangles, boxes and specks all around the eye.
+    fn clutter() -> PreparedScene<PreparedBytes> {
+        let mut text = "viewport origin 0.1 0.2 0.3 topleft -1 1 -1 bottomleft -1 -1 -1.2
+            topright 1 1 -0.9 endviewport materials entry name a endentry endmaterials geometry "
+            .to_owned();
+        let mut state = 1_u32;
+        let mut random = || {
+            state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+            f64::from(state >> 8) / f64::from(1 << 24)
+        };
+        for k in 0..400 {
+            let mut place = || [0; 3].map(|_| 6.0 * random() - 3.0);
+            let ([x, y, z], [u, v, w]) = (place(), place().map(|c| 0.2 * c));
+            let corners = format!("vertex {x} {y} {z} vertex {} {y} {}", x + u, z + w);
+            match k % 4 {
+                0 => write!(
+                    text,
+                    "triangle {corners} vertex {x} {} {z} material a endtriangle ",
+                    y + v
+                ),
+                1 => write!(
+                    text,
+                    "quadrangle {corners} vertex {} {} {} vertex {x} {} {z} material a
+                     endquadrangle ",
+                    x + u,
+                    y + v,
+                    z + w,
+                    y + v
+                ),
+                2 => write!(
+                    text,
+                    "union parallelepiped {corners} vertex {x} {} {z} vertex {} {y} {}
+                     material a endparallelepiped sphere coords {x} {y} {z} radius 0.01 material a
+                     endsphere endunion ",
+                    y + v,
+                    x - w,
+                    z + u
+                ),
+                _ => write!(text, "sphere coords {x} {y} {z} radius 0.01 material a endsphere "),
+            }
+            .unwrap();
+        }
+        let nothing = |_: &str| Err(std::io::ErrorKind::NotFound.into());
+        let scene = read_scene((text + "endgeometry").as_bytes(), &nothing).scene.unwrap();
+        PreparedScene::open(prepare(&scene).unwrap()).unwrap()
+    }
+
+    #[test]
+    fn beams_meet_the_faces_that_they_meet_without_the_hierarchy() {
+        let scene = clutter();
+        let view = scene.view();
+        let mut beams = Beams::new(&view, Size::new(40, 30).unwrap(), false, 1.0).unwrap();
+        let mut total = 0;
+        for block in [1, 2, 8]
+            .into_iter()
+            .flat_map(|side| blocks(Area { x0: 0, y0: 0, width: 40, height: 30 }, side))
+        {
+            for deepest in [0.7, 2.0, f64::INFINITY] {
+                assert!(beams.gather(block, deepest, usize::MAX));
+                let mut found: Vec<u32> = beams.outlines.iter().map(|face| face.rank).collect();
+                beams.outlines.clear();
+                beams.corners.clear();
+                view.items.iter().for_each(|&item| beams.gather_item(item, block, deepest));
+                let mut all: Vec<u32> = beams.outlines.iter().map(|face| face.rank).collect();
+                found.sort_unstable();
+                all.sort_unstable();
+                assert_eq!(found, all, "{block:?}");
+                total += all.len();
+            }
+        }
+        eprintln!("{total} faces in all beams");
+        assert!(total > 1000);
+    }
+
+    #[test]
+    fn pieces_of_a_face_in_all_pixels_are_the_face() {
+        let scene = clutter();
+        let view = scene.view();
+        let size = Size::new(40, 30).unwrap();
+        let whole = Area { x0: 0, y0: 0, width: 40, height: 30 };
+        let mut beams = Beams::new(&view, size, false, 1.0).unwrap();
+        assert!(beams.gather(whole, f64::INFINITY, usize::MAX));
+        let inside = |face: &Outline| {
+            face.low[0] > 0.0 && face.low[1] > 0.0 && face.high[0] < 40.0 && face.high[1] < 30.0
+        };
+        let faces: Vec<Outline> = beams.outlines.iter().copied().filter(inside).collect();
+        assert!(faces.len() > 20);
+        for face in faces {
+            let corners = &beams.corners[face.first..face.first + face.count];
+            let mut area = 0.0;
+            for (k, a) in corners.iter().enumerate() {
+                let b = &corners[(k + 1) % corners.len()];
+                area += (a[0] * b[1] - a[1] * b[0]) / 2.0;
+            }
+            let pieces = pixels_of(whole).filter_map(|(x0, y0)| {
+                let pixel = Area { x0, y0, width: 1, height: 1 };
+                face.meets(pixel).then(|| beams.cut_to(pixel, &face))?.map(|piece| piece.share)
+            });
+            let sum: f64 = pieces.sum();
+            assert!((sum - area.abs()).abs() < 1e-9, "{sum} of {area}");
+        }
+    }
+
+    #[test]
+    fn a_power_is_a_product() {
+        assert_eq!(power(0.5, 0), 1.0);
+        assert_eq!(power(0.5, 13), 1.0 / 8192.0);
+        assert_eq!(power(0.0, 8), 0.0);
+    }
 }
