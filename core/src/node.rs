@@ -98,6 +98,9 @@ pub(crate) struct BoxRay {
 /// of the f64 tests, which is 2^29 times finer.
 const FAR: f32 = 1.0 + 4.0 * f32::EPSILON;
 
+/// Three f32 roundings may move a near plane by 1.5 ulp away: so much more is within reach.
+const NEAR: f64 = 2.0 * f32::EPSILON as f64;
+
 impl BoxRay {
     #[inline(always)]
     pub(crate) fn new(origin: DVec3, direction: DVec3, reach: f64, frame: &Frame) -> Self {
@@ -152,10 +155,12 @@ impl BoxRay {
         ray
     }
 
-    /// Boxes that begin beyond `t` no longer count.
+    /// Boxes that begin beyond `t` no longer count, nor may those that begin just there be lost:
+    /// what is in them may come first in the file.
     #[inline(always)]
     pub(crate) fn shorten(&mut self, t: f64) {
-        self.high = above((t - self.start) * self.scale + self.slack);
+        let reach = (t - self.start) * self.scale + self.slack;
+        self.high = above(reach + reach.abs() * NEAR);
     }
 
     /// Whether a box that begins at `near` still counts.

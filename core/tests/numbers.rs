@@ -721,6 +721,68 @@ fn planes_a_ten_millionth_apart_are_met_in_their_order() {
     tell(60, "of planes 1e-7 apart the nearer is met first", format!("0 wrong of {count} rays"));
 }
 
+/// `count` x `count` squares that fill -1..1 in the plane at `z`.
+fn tiled_plane(count: usize, z: f64) -> Vec<[DVec3; 4]> {
+    let at = |k: usize| 2.0 * k as f64 / count as f64 - 1.0;
+    let corners = |k: usize| {
+        let (x, y) = (k % count, k / count);
+        [(x, y), (x + 1, y), (x + 1, y + 1), (x, y + 1)].map(|(x, y)| DVec3::new(at(x), at(y), z))
+    };
+    (0..count * count).map(corners).collect()
+}
+
+/// Faces closer together than a box can tell: which is met must not hang on whose box comes first.
+#[test]
+fn of_faces_in_many_boxes_the_first_is_met() {
+    let z = 0.377;
+    let strip = |k: usize| {
+        let x = 2.0 * k as f64 / 50.0 - 1.0;
+        [(x, -1.0), (x + 0.01, -1.0), (x + 0.03, 1.0), (x + 0.02, 1.0)]
+            .map(|(x, y)| DVec3::new(x, y, z))
+    };
+    let strips: Vec<[DVec3; 4]> = (0..50).map(strip).collect();
+    let mut scenes = Vec::new();
+    for wall in [tiled_plane(1, z), tiled_plane(12, z)] {
+        scenes.push((66, [strips.clone(), wall.clone()].concat()));
+        scenes.push((66, [wall, strips.clone()].concat()));
+    }
+    for gap in [1e-7, 1e-9] {
+        scenes.push((60, [tiled_plane(13, z), tiled_plane(11, z + gap)].concat()));
+        scenes.push((60, [tiled_plane(1, z), tiled_plane(12, z + gap)].concat()));
+    }
+    let (mut counts, mut hits) = ([0, 0], 0);
+    for (stream, (case, faces)) in (6600..).zip(&scenes) {
+        let block = opened(&of_quadrangles(faces));
+        let mut random = random(stream);
+        let probes: Vec<Probe> = (0..rays(100_000) / 8)
+            .map(|_| {
+                let target = (random.in_cube() * DVec3::new(1.0, 1.0, 0.0)).with_z(z);
+                probe(target + random.direction() * random.log_uniform(1e-2, 1e2), target)
+            })
+            .collect();
+        let truth = block.probe_all_faces(&probes);
+        hits += truth.iter().flatten().count();
+        for isa in Isa::ALL.into_iter().filter(|isa| isa.is_supported()) {
+            for (k, found) in block.probe(&probes, isa).into_iter().enumerate() {
+                assert_eq!(found, truth[k], "{isa}: {:?}", probes[k]);
+            }
+        }
+        counts[usize::from(*case == 66)] += probes.len();
+    }
+    assert!(hits > rays(50_000));
+    let [apart, coincident] = counts;
+    tell(
+        60,
+        "of planes 1e-7 and 1e-9 apart in many boxes the nearer is met, as without boxes",
+        format!("0 wrong of {apart} rays"),
+    );
+    tell(
+        66,
+        "of coincident faces in many boxes the first is met, as without boxes",
+        format!("0 wrong of {coincident} rays"),
+    );
+}
+
 #[test]
 fn pictures_do_not_depend_on_instructions_or_threads() {
     let (mut count, mut blocks) = (0, 0);
