@@ -68,8 +68,8 @@ fn sheet([left, right]: [f64; 2], material: &str) -> String {
 
 #[test]
 fn every_colour_looks_as_it_is_written() {
-    let materials: String =
-        (0..256).map(|k| format!("entry name m{k} color {k} {} 255 endentry\n", 255 - k)).collect();
+    let material = |k: u32| format!("entry name m{k} color {k} {} 255 endentry\n", 255 - k);
+    let materials: String = (0..256).map(material).collect();
     let square = |k: u32| {
         let (x, y) = (k % 16, k / 16);
         let (right, bottom) = (x + 1, y + 1);
