@@ -68,16 +68,17 @@ fn sheet([left, right]: [f64; 2], material: &str) -> String {
 
 #[test]
 fn every_colour_looks_as_it_is_written() {
-    let (mut materials, mut geometry) = (String::new(), String::new());
-    for k in 0..256 {
+    let material = |k: u32| format!("entry name m{k} color {k} {} 255 endentry\n", 255 - k);
+    let materials: String = (0..256).map(material).collect();
+    let square = |k: u32| {
         let (x, y) = (k % 16, k / 16);
         let (right, bottom) = (x + 1, y + 1);
-        materials += &format!("entry name m{k} color {k} {} 255 endentry\n", 255 - k);
-        geometry += &format!(
+        format!(
             "quadrangle vertex {x} -{bottom} 0 vertex {right} -{bottom} 0 vertex {right} -{y} 0
             vertex {x} -{y} 0 material m{k} endquadrangle\n"
-        );
-    }
+        )
+    };
+    let geometry: String = (0..256).map(square).collect();
     let text = format!("materials {materials} endmaterials geometry {geometry} endgeometry");
     for transfer in BOTH {
         let settings = settings(16, 16, 4);
