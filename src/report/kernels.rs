@@ -373,9 +373,14 @@ mod tests {
         let stop = CancellationToken::new();
         let cases = Case::measure_all(amount, &|_, _| Ok(Vec::new()), &stop).unwrap().unwrap();
         assert_eq!(cases.len(), 12);
-        for kernel in cases.iter().flat_map(|case| &case.kernels) {
-            let is_ours = kernel.name.starts_with("rtfarm");
-            assert!(!is_ours || (kernel.leaks == 0 && kernel.worst < 1e-14), "{}", kernel.name);
+        for case in &cases {
+            // Rounded to a coarse grid many faces lie in one plane; their distance is the plane's,
+            // as exact as the origin's coordinates are.
+            let most = if case.moved == 1e5 { 1e-10 } else { 1e-14 };
+            let ours = case.kernels.iter().filter(|kernel| kernel.name.starts_with("rtfarm"));
+            for Kernel { name, leaks, worst, .. } in ours {
+                assert!(*leaks == 0 && *worst < most, "{name} {}: {leaks} {worst}", case.moved);
+            }
         }
         let leaks_of = |name: &str| -> usize {
             let kernels = cases.iter().flat_map(|case| &case.kernels);

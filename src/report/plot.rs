@@ -42,6 +42,7 @@ pub(super) fn errors(ladders: &[Ladder]) -> anyhow::Result<String> {
             x: "time on one thread, ms",
             y: "RMSE",
             is_joined: true,
+            legend: SeriesLabelPosition::UpperRight,
             series: (ladder.series.iter())
                 .map(|series| {
                     let points = series.rungs.iter().map(|rung| {
@@ -65,6 +66,7 @@ pub(super) fn kernels(cases: &[Case]) -> anyhow::Result<String> {
             x: "million rays a second",
             y: "largest relative error",
             is_joined: false,
+            legend: SeriesLabelPosition::UpperLeft,
             series: (names(cases).into_iter())
                 .map(|name| {
                     let kernels = cases.iter().flat_map(|case| &case.kernels);
@@ -86,6 +88,7 @@ struct Panel {
     x: &'static str,
     y: &'static str,
     is_joined: bool,
+    legend: SeriesLabelPosition,
     series: Vec<(String, Vec<[f64; 3]>)>,
 }
 
@@ -115,13 +118,24 @@ impl Panel {
         if low <= high { low / 1.5..high * 1.5 } else { 0.1..1.0 }
     }
 
+    /// The same across, with room for a long legend.
+    fn limits_across(&self) -> Range<f64> {
+        let Range { start, end } = self.limits(0);
+        // Half as wide again, in logarithms.
+        let more = if self.series.len() > 2 { (end / start).sqrt().max(2.0) } else { 1.0 };
+        match self.legend {
+            SeriesLabelPosition::UpperLeft => start / more..end,
+            _ => start..end * more,
+        }
+    }
+
     fn draw<'a>(&self, area: &Area<'a>) -> Result<(), Failed<'a>> {
         let mut chart = ChartBuilder::on(area)
             .caption(&self.caption, ("sans-serif", 16))
             .margin(10)
             .x_label_area_size(36)
             .y_label_area_size(64)
-            .build_cartesian_2d(self.limits(0).log_scale(), self.limits(1).log_scale())?;
+            .build_cartesian_2d(self.limits_across().log_scale(), self.limits(1).log_scale())?;
         chart
             .configure_mesh()
             .x_labels(4)
@@ -144,10 +158,6 @@ impl Panel {
                 PathElement::new([(x, low), (x, y + band)], color.stroke_width(1))
             }))?;
         }
-        chart
-            .configure_series_labels()
-            .position(SeriesLabelPosition::UpperRight)
-            .background_style(WHITE)
-            .draw()
+        chart.configure_series_labels().position(self.legend.clone()).background_style(WHITE).draw()
     }
 }
