@@ -79,7 +79,7 @@ impl Plan {
                 peers_reach: Reach { rungs: 6, seeds: 9 },
             },
             Effort::Full => Self {
-                width: 128,
+                width: 96,
                 reach: Reach { rungs: 8, seeds: 16 },
                 reference: 16_384,
                 kernels: Amount { rays: 200_000, exact: 2_000, textbook: 20_000, runs: 15 },

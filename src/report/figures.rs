@@ -101,10 +101,15 @@ impl Spread {
 /// The median and, in brackets, the quartiles: three digits of each.
 impl fmt::Display for Spread {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let digits = [100.0, 10.0].iter().filter(|&&size| self.median < size).count();
+        let digits = decimals(self.median);
         let Self { low, median, high } = self;
         write!(f, "{median:.digits$} ({low:.digits$}–{high:.digits$})")
     }
+}
+
+/// How many show three digits of a number from 1 up.
+pub(super) fn decimals(number: f64) -> usize {
+    [100.0, 10.0].iter().filter(|&&size| number < size).count()
 }
 
 /// The middle one.

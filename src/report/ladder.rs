@@ -90,7 +90,11 @@ impl Ladder {
     /// moment of the machine meets both. `None` when `stop` came first.
     pub(super) fn climb(subject: Subject, reach: Reach, stop: &CancellationToken) -> Option<Self> {
         let fixed = (0..reach.rungs).map(|rung| Sampling::Fixed(8 << rung));
-        let adaptive = pilot::ladder().step_by(2).take(reach.rungs);
+        // Over one range however many there are: 16 to 0.5 steps of 8 bits.
+        let finest = 10;
+        let last = reach.rungs.max(2) - 1;
+        let adaptive =
+            (0..reach.rungs).filter_map(|rung| pilot::ladder().nth(rung * finest / last));
         let mut series = ["--samples", "--error"]
             .map(|name| Series { name: name.to_owned(), rungs: Vec::new() });
         for (fixed, adaptive) in fixed.zip(adaptive) {

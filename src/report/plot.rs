@@ -41,6 +41,7 @@ pub(super) fn errors(ladders: &[Ladder]) -> anyhow::Result<String> {
             caption: ladder.name.clone(),
             x: "time on one thread, ms",
             y: "RMSE",
+            y_limits: None,
             is_joined: true,
             legend: SeriesLabelPosition::UpperRight,
             series: (ladder.series.iter())
@@ -65,6 +66,8 @@ pub(super) fn kernels(cases: &[Case]) -> anyhow::Result<String> {
             caption: format!("the mesh moved by {:e}", cases[0].moved),
             x: "million rays a second",
             y: "largest relative error",
+            // From double precision to worse than single.
+            y_limits: Some(3e-17..1e-5),
             is_joined: false,
             legend: SeriesLabelPosition::UpperLeft,
             series: (names(cases).into_iter())
@@ -87,6 +90,8 @@ struct Panel {
     caption: String,
     x: &'static str,
     y: &'static str,
+    /// Those of the points otherwise.
+    y_limits: Option<Range<f64>>,
     is_joined: bool,
     legend: SeriesLabelPosition,
     series: Vec<(String, Vec<[f64; 3]>)>,
@@ -130,12 +135,13 @@ impl Panel {
     }
 
     fn draw<'a>(&self, area: &Area<'a>) -> Result<(), Failed<'a>> {
+        let y_limits = self.y_limits.clone().unwrap_or_else(|| self.limits(1));
         let mut chart = ChartBuilder::on(area)
             .caption(&self.caption, ("sans-serif", 16))
             .margin(10)
             .x_label_area_size(36)
             .y_label_area_size(64)
-            .build_cartesian_2d(self.limits_across().log_scale(), self.limits(1).log_scale())?;
+            .build_cartesian_2d(self.limits_across().log_scale(), y_limits.log_scale())?;
         chart
             .configure_mesh()
             .x_labels(4)

@@ -5,7 +5,7 @@ use std::fmt::Write;
 use rtfarm_core::isa::Isa;
 
 use super::{
-    figures::{Errors, Spread, mean_and_band, median, slope},
+    figures::{Errors, Spread, decimals, mean_and_band, median, slope},
     kernels::{Amount, Case, Kernel, names},
     ladder::{Ladder, Rung},
     plot,
@@ -14,9 +14,6 @@ use crate::VERSION;
 
 /// The errors that a user may want, in 8-bit steps.
 const WANTED: [f64; 5] = [8.0, 4.0, 2.0, 1.0, 0.5];
-
-/// An error that nobody asks to fall further.
-const NEGLIGIBLE: f64 = 1e-4;
 
 const LEGEND: &str = "Errors are of a channel, 1 is full light. `ms`: of one thread. `relMSE`: the \
     mean of error² / (truth² + 0.01). `FLIP`: the mean difference to the eye in 8 bits, 0 to 1. \
@@ -168,21 +165,25 @@ fn soonest(ladder: &Ladder, wanted: Option<f64>) -> String {
 
 /// What holds over all scenes.
 fn summary(ladders: &[Ladder]) -> String {
-    let mut text = String::from("## How well a render tells its error\n\n");
-    for (kind, of) in
-        [("fixed", Ladder::fixed as fn(&Ladder) -> &[Rung]), ("adaptive", Ladder::adaptive)]
-    {
+    let mut text = String::from(
+        "## How well a render tells its error\n\nTold over true: the median, and the least and the \
+         most of all settings and seeds. Of an image seen from afar the filter is part of the \
+         error, and no sample shows it.\n\n| scene | fixed | adaptive |\n|---|---|---|\n",
+    );
+    let cell = |ladders: &[Ladder], of: fn(&Ladder) -> &[Rung]| {
         let rungs = ladders.iter().flat_map(of);
         let mut told: Vec<f64> = rungs.flat_map(|rung| rung.told.iter().copied()).collect();
         told.sort_by(f64::total_cmp);
-        if let (Some(low), Some(high)) = (told.first(), told.last()) {
-            let _ = writeln!(
-                text,
-                "- {kind} samples: told over true {low:.2} to {high:.2}, median {:.2}, over {} pictures.",
-                median(&told),
-                told.len()
-            );
-        }
+        let ends = told.first().zip(told.last());
+        ends.map_or(String::new(), |(low, high)| {
+            format!("{:.2} ({low:.2}–{high:.2}), {} pictures", median(&told), told.len())
+        })
+    };
+    let names = ladders.iter().map(|ladder| ladder.name.as_str()).chain(["all"]);
+    let parts = ladders.chunks(1).chain([ladders]);
+    for (name, part) in names.zip(parts) {
+        let (fixed, adaptive) = (cell(part, Ladder::fixed), cell(part, Ladder::adaptive));
+        let _ = writeln!(text, "| {name} | {fixed} | {adaptive} |");
     }
     text += "\n## Adaptive against fixed samples\n\nAt the RMSE of an adaptive setting, how many \
              times its time and its samples a fixed number takes.\n\n| scene | setting | time | samples |\n|---|---|---|---|\n";
@@ -216,7 +217,7 @@ fn peers(ladders: &[Ladder]) -> String {
          Milliseconds to an RMSE, between the two settings beside it by the slope of their \
          logarithms; `-` where no setting measured comes to it, `<` where the first is better \
          already. `stays` is the RMSE that the last settings do not get below: the slope of the last \
-         three is above -0.15, which is bias of the renderer or of the way it was asked.\n\n",
+         four is above -0.25, which is bias of the renderer or of the way it was asked.\n\n",
         plot::PEERS_FILE
     );
     text += "| scene | renderer |";
@@ -229,10 +230,11 @@ fn peers(ladders: &[Ladder]) -> String {
             for steps in WANTED {
                 let _ = write!(text, " {} |", time_to(&series.rungs, steps / 255.0));
             }
-            let last = &series.rungs[series.rungs.len().saturating_sub(3)..];
+            let last = &series.rungs[series.rungs.len().saturating_sub(4)..];
             let points = last.iter().map(|rung| (rung.time(), rung.rmse().0));
             let lowest = last.iter().map(|rung| rung.rmse().0).fold(f64::INFINITY, f64::min);
-            let stays = slope(points).is_some_and(|slope| slope > -0.15) && lowest > NEGLIGIBLE;
+            let stays =
+                slope(points).is_some_and(|slope| slope > -0.25) && lowest > WANTED[4] / 255.0;
             let stays = if stays { format!("{lowest:.0e}") } else { String::new() };
             let _ = writeln!(text, " {stays} |");
         }
@@ -244,10 +246,11 @@ fn peers(ladders: &[Ladder]) -> String {
 
 fn time_to(rungs: &[Rung], wanted: f64) -> String {
     if rungs[0].rmse().0 <= wanted {
-        return format!("< {:.3}", rungs[0].time());
+        let (time, digits) = (rungs[0].time(), decimals(rungs[0].time()));
+        return format!("< {time:.digits$}");
     }
     at_rmse(rungs, wanted, &Rung::time).map_or("-".to_owned(), |time| {
-        let digits = [100.0, 10.0].iter().filter(|&&size| time < size).count();
+        let digits = decimals(time);
         format!("{time:.digits$}")
     })
 }
