@@ -79,7 +79,7 @@ pub(crate) struct ReportArgs {
     #[arg(value_name = "SCENE")]
     pub(crate) scene: Option<PathBuf>,
 
-    /// The folder that report.md and its plot go into; without it the report goes to standard
+    /// The folder that report.md and its plots go into; without it the report goes to standard
     /// output.
     #[arg(long, value_name = "DIR")]
     pub(crate) out: Option<PathBuf>,
@@ -87,6 +87,19 @@ pub(crate) struct ReportArgs {
     /// How much work goes into it.
     #[arg(long, value_name = "EFFORT", default_value = "quick")]
     pub(crate) effort: Effort,
+
+    /// The error of SCENE's picture that is wanted, where 1 is full light; some by default.
+    #[arg(long, value_name = "ERROR", requires = "scene", value_parser = parse_error)]
+    pub(crate) wanted: Option<f64>,
+
+    /// A folder with what other programs made of the scenes and rays of `--for-peers`, to stand
+    /// beside rtfarm's.
+    #[arg(long, value_name = "DIR", conflicts_with = "scene")]
+    pub(crate) peers: Option<PathBuf>,
+
+    /// Only write these scenes and rays into a folder, for the same effort.
+    #[arg(long, value_name = "DIR", conflicts_with_all = ["scene", "peers", "out"])]
+    pub(crate) for_peers: Option<PathBuf>,
 }
 
 /// How much work goes into a report.

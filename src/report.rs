@@ -1,14 +1,18 @@
 //! `rtfarm report`: speed against error, from renders that the report makes itself.
 //!
-//! Without a scene: pictures with closed forms, so the error is the true one. With a scene: its own
-//! picture at many samples stands for the truth.
+//! Without a scene: pictures with closed forms, so the error is the true one, and rays through a
+//! closed mesh. With a scene: its own picture at many samples stands for the truth.
 
 mod figures;
+mod flip;
+mod kernels;
 mod ladder;
+mod peers;
 mod plot;
 mod tables;
 
 use std::{
+    collections::BTreeMap,
     fs,
     io::{self, Write},
     os::unix::fs::PermissionsExt,
@@ -24,7 +28,7 @@ use rtfarm_core::{
     render::{Quality, Sampling, Settings, render_tile},
     tile::{Area, Size},
 };
-use rtfarm_oracle::known_pictures::known_pictures;
+use rtfarm_oracle::known_pictures::{indirect_pictures, known_pictures, known_size};
 use tokio::task::spawn_blocking;
 use tokio_util::sync::CancellationToken;
 
@@ -34,30 +38,63 @@ use crate::{
     failure::Failure,
     source::{SceneText, scene_folder},
 };
-use ladder::{Ladder, Subject};
+use figures::Truth;
+use kernels::{Amount, Case};
+use ladder::{Ladder, Reach, Reference, Subject};
 
 /// The width of a user's own picture in the report, in pixels; its height follows.
 const OWN_WIDTH: f64 = 160.0;
 
 /// How much work a report is.
+#[derive(Debug, Clone, Copy)]
 struct Plan {
     /// Pixels across a closed-form picture.
     width: u32,
-    seeds: u64,
-    /// Rungs of each ladder.
-    rungs: usize,
+    reach: Reach,
     /// Samples of what stands for the truth of a user's scene.
     reference: u32,
+    kernels: Amount,
+    /// Pixels across a picture that other renderers make too: more, for some start slowly.
+    peers_width: u32,
+    peers_reach: Reach,
 }
 
 impl Plan {
     fn new(effort: Effort) -> Self {
         match effort {
-            Effort::Smoke => Self { width: 24, seeds: 2, rungs: 3, reference: 512 },
-            Effort::Quick => Self { width: 64, seeds: 8, rungs: 6, reference: 4096 },
-            Effort::Full => Self { width: 128, seeds: 16, rungs: 8, reference: 16_384 },
+            Effort::Smoke => Self {
+                width: 24,
+                reach: Reach { rungs: 3, seeds: 2 },
+                reference: 512,
+                kernels: Amount { rays: 500, exact: 5, textbook: 50, runs: 1 },
+                peers_width: 24,
+                peers_reach: Reach { rungs: 2, seeds: 2 },
+            },
+            Effort::Quick => Self {
+                width: 64,
+                reach: Reach { rungs: 6, seeds: 8 },
+                reference: 4096,
+                kernels: Amount { rays: 20_000, exact: 100, textbook: 2_000, runs: 9 },
+                peers_width: 128,
+                peers_reach: Reach { rungs: 6, seeds: 9 },
+            },
+            Effort::Full => Self {
+                width: 96,
+                reach: Reach { rungs: 8, seeds: 16 },
+                reference: 16_384,
+                kernels: Amount { rays: 200_000, exact: 2_000, textbook: 20_000, runs: 15 },
+                peers_width: 256,
+                peers_reach: Reach { rungs: 6, seeds: 9 },
+            },
         }
     }
+}
+
+/// What a report holds, and its text and plots.
+struct Report {
+    text: String,
+    /// Files beside it.
+    plots: Vec<(&'static str, String)>,
 }
 
 pub(crate) async fn run(
@@ -66,38 +103,103 @@ pub(crate) async fn run(
     stop: &CancellationToken,
 ) -> Result<(), Failure> {
     let plan = Plan::new(args.effort);
+    if let Some(folder) = args.for_peers {
+        let writing = spawn_blocking(move || {
+            peers::write(&folder, known_size(plan.peers_width), plan.kernels.rays)
+        });
+        return Ok(writing.await??);
+    }
     let token = stop.clone();
-    let subjects = if let Some(scene) = args.scene() {
-        vec![own_subject(&scene, &plan, console, stop).await?]
+    let report = if let Some(scene) = args.scene() {
+        let subject = own_subject(&scene, &plan, console, stop).await?;
+        let wanted = args.wanted;
+        spawn_blocking(move || on_scene(subject, &plan, wanted, &token)).await??
     } else {
-        let width = plan.width;
-        let known = spawn_blocking(move || known_pictures(width)).await?;
-        known.into_iter().map(Subject::from).collect()
+        spawn_blocking(move || on_known(&plan, args.peers.as_deref(), &token)).await??
     };
-    let measured = spawn_blocking(move || {
-        let ladders = subjects.into_iter().map(|subject| Ladder::climb(subject, &plan, &token));
-        ladders.collect::<Option<Vec<Ladder>>>()
-    });
-    let ladders = measured.await?.ok_or(Failure::Interrupted)?;
-    let is_own = args.scene.is_some();
-    let text = tables::report(&ladders, is_own);
+    let report = report.ok_or(Failure::Interrupted)?;
     if let Some(folder) = &args.out {
-        write(folder, &text, &ladders)?;
+        write(folder, &report)?;
     } else {
         io::stdout()
             .lock()
-            .write_all(text.as_bytes())
+            .write_all(report.text.as_bytes())
             .context("cannot write to standard output")?;
     }
     Ok(())
 }
 
-/// Puts the report and its plot into a folder, each file whole or not at all.
-fn write(folder: &Path, text: &str, ladders: &[Ladder]) -> anyhow::Result<()> {
+/// The report on a user's scene. `None` when `stop` came first.
+fn on_scene(
+    subject: Subject,
+    plan: &Plan,
+    wanted: Option<f64>,
+    stop: &CancellationToken,
+) -> anyhow::Result<Option<Report>> {
+    let Some(ladder) = Ladder::climb(subject, plan.reach, stop) else { return Ok(None) };
+    let text = tables::on_scene(&ladder, wanted);
+    let plots = vec![(plot::ERROR_FILE, plot::errors(&[ladder])?)];
+    Ok(Some(Report { text, plots }))
+}
+
+/// The report on pictures and distances that are known, with what others left in `folder`. `None`
+/// when `stop` came first.
+fn on_known(
+    plan: &Plan,
+    folder: Option<&Path>,
+    stop: &CancellationToken,
+) -> anyhow::Result<Option<Report>> {
+    // What others left is read first: what is wrong with it is told before the work.
+    let beside: Vec<Subject> = match folder {
+        Some(_) => known_pictures(plan.peers_width).into_iter().map(Subject::from).collect(),
+        None => Vec::new(),
+    };
+    let truth_of = |name: &str| {
+        beside.iter().find(|subject| subject.name == name).map(|subject| &subject.truth)
+    };
+    let mut others = match folder {
+        Some(folder) => peers::read_pictures(folder, &truth_of)?,
+        None => BTreeMap::new(),
+    };
+    let kernels_of = |moved, aim| match folder {
+        Some(folder) => peers::read_kernels(folder, moved, aim),
+        None => Ok(Vec::new()),
+    };
+
+    let Some(cases) = Case::measure_all(plan.kernels, &kernels_of, stop)? else { return Ok(None) };
+    let known = known_pictures(plan.width).into_iter().chain(indirect_pictures(plan.width));
+    let climb = |subject| Ladder::climb(subject, plan.reach, stop);
+    let Some(ladders) = known.map(Subject::from).map(climb).collect::<Option<Vec<_>>>() else {
+        return Ok(None);
+    };
+    let mut ladders_beside = Vec::new();
+    for subject in beside {
+        let Some(series) = others.remove(&subject.name) else { continue };
+        let climbed = Ladder::climb(subject, plan.peers_reach, stop);
+        let Some(mut ladder) = climbed else { return Ok(None) };
+        ladder.series.extend(series);
+        ladders_beside.push(ladder);
+    }
+
+    let text = tables::on_known(&ladders, &ladders_beside, &cases, plan.kernels);
+    let mut plots = vec![
+        (plot::ERROR_FILE, plot::errors(&ladders)?),
+        (plot::KERNEL_FILE, plot::kernels(&cases)?),
+    ];
+    if !ladders_beside.is_empty() {
+        plots.push((plot::PEERS_FILE, plot::errors(&ladders_beside)?));
+    }
+    Ok(Some(Report { text, plots }))
+}
+
+/// Puts the report and its plots into a folder, each file whole or not at all.
+fn write(folder: &Path, report: &Report) -> anyhow::Result<()> {
     let in_place = || format!("cannot write into the folder {}", folder.display());
     fs::create_dir_all(folder).with_context(in_place)?;
-    let text = format!("{text}\n![error against time]({})\n", plot::FILE);
-    for (name, content) in [("report.md", text), (plot::FILE, plot::draw(ladders)?)] {
+    let text = [("report.md", &report.text)];
+    for (name, content) in
+        text.into_iter().chain(report.plots.iter().map(|(name, plot)| (*name, plot)))
+    {
         let file = tempfile::Builder::new()
             .permissions(fs::Permissions::from_mode(0o666))
             .tempfile_in(folder)
@@ -143,7 +245,13 @@ async fn own_subject(
     let rendering = spawn_blocking(move || {
         let truth = render_rows(&prepared, size, Sampling::Fixed(count), u64::MAX, &stop)?;
         let truth = truth.iter().map(|pixel| pixel.map(f64::from)).collect();
-        Some(Subject { name, scene: prepared, size, truth, reference: Some(count) })
+        let truth = Truth::new(truth, size);
+        Some(Subject {
+            name,
+            scene: prepared,
+            truth,
+            reference: Some(Reference { samples: count, full_size: wish }),
+        })
     });
     rendering.await?.ok_or(Failure::Interrupted)
 }

@@ -20,6 +20,7 @@ use rtfarm_core::{
 };
 use rtfarm_oracle::{
     Settings as OracleSettings, eye_direction,
+    known_pictures::checkerboard,
     random::Random,
     random_scene::{Recipe, Style, random_scene},
     reference_picture,
@@ -147,13 +148,6 @@ fn noise(width: u32, height: u32) -> RgbImage {
     RgbImage::from_fn(width, height, |_, _| image::Rgb([(); 3].map(|()| random.bits() as u8)))
 }
 
-/// A checkerboard of two squares by two, dark at the upper left.
-fn checkerboard(side: u32) -> RgbImage {
-    RgbImage::from_fn(side, side, |x, y| {
-        image::Rgb([if (x < side / 2) == (y < side / 2) { 0 } else { 255 }; 3])
-    })
-}
-
 fn worst(found: &[[f32; 3]], truth: &[[f64; 3]]) -> f64 {
     let differences =
         found.iter().zip(truth).flat_map(|(f, t)| (0..3).map(|c| f64::from(f[c]) - t[c]));
@@ -265,46 +259,20 @@ fn plane_scene(image: &RgbImage) -> Scene {
     )
 }
 
-/// The share of a checkerboard's bright squares between two coordinates along a row of them.
-fn bright_share(from: f64, to: f64, starts_dark: bool) -> f64 {
-    // Bright where the fraction is 0.5 or more.
-    let up_to = |x: f64| x.floor() * 0.5 + (x - x.floor() - 0.5).max(0.0);
-    let share = (up_to(to) - up_to(from)) / (to - from);
-    if starts_dark { share } else { 1.0 - share }
-}
-
 #[test]
 fn a_checkerboard_fades_to_its_mean_at_the_horizon() {
-    let scene = prepared(&plane_scene(&checkerboard(256)));
-    let (width, height) = (96, 72);
+    let known = checkerboard(settings(96, 72, 1).size);
+    let scene = prepared(&known.scene);
+    let (width, height) = (96_u32, 72_u32);
     // The row at which the horizon lies, exactly between two rows of pixels.
     let horizon = height / 3;
-    // In a row of the screen the depth is one, and the squares are clipped at once.
-    let truth: Vec<f64> = (0..width * height)
-        .map(|k| {
-            let (x, y) = (k % width, k / width);
-            if y < horizon {
-                return 0.0;
-            }
-            let lines = 4096_u32;
-            let line = |k: u32| {
-                let down =
-                    (f64::from(y) + (f64::from(k) + 0.5) / f64::from(lines)) / f64::from(height);
-                let depth = 1.0 / (1.5 * down - 0.5);
-                let across = |x: u32| depth * (1.2 * f64::from(x) / f64::from(width) - 0.6);
-                let v = -depth;
-                bright_share(across(x), across(x + 1), v - v.floor() < 0.5)
-            };
-            (0..lines).map(line).sum::<f64>() / f64::from(lines)
-        })
-        .collect();
     let mut errors = Vec::new();
     for samples in [1, 4, 16, 64, 256] {
         let settings = settings(width.into(), height.into(), samples);
         let found = pixels(&scene, &settings, whole(settings.size));
         let (mut far, mut worst, mut squares) = (0.0_f64, 0.0_f64, 0.0);
-        for (k, (found, truth)) in (0..).zip(found.iter().zip(&truth)) {
-            let error = (f64::from(found[0]) - truth).abs();
+        for (k, (found, truth)) in (0..).zip(found.iter().zip(&known.truth)) {
+            let error = (f64::from(found[0]) - truth[0]).abs();
             let row = k / width;
             // There a pixel covers six squares and more in depth.
             if (horizon..horizon + 4).contains(&row) {

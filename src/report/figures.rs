@@ -1,6 +1,31 @@
 //! Pictures against the truth, in numbers.
 
-use rtfarm_core::render::Sampling;
+use std::fmt;
+
+use rtfarm_core::tile::Size;
+
+use super::flip::Seen;
+
+/// A true picture.
+pub(super) struct Truth {
+    /// The mean over each pixel, linear, row by row.
+    pub(super) pixels: Vec<[f64; 3]>,
+    pub(super) size: Size,
+    seen: Seen,
+}
+
+impl Truth {
+    pub(super) fn new(pixels: Vec<[f64; 3]>, size: Size) -> Self {
+        let seen = Seen::new(&in_8_bits(pixels.as_flattened().iter().copied()), size);
+        Self { pixels, size, seen }
+    }
+}
+
+/// As a PNG of 8 bits a channel has it.
+fn in_8_bits(channels: impl Iterator<Item = f64>) -> Vec<[u8; 3]> {
+    let bytes: Vec<u8> = channels.map(|x| (255.0 * x.clamp(0.0, 1.0)).round() as u8).collect();
+    bytes.as_chunks().0.to_vec()
+}
 
 /// How far a picture is off. Channels count alike; 1 is full light.
 #[derive(Debug, Clone)]
@@ -11,6 +36,8 @@ pub(super) struct Errors {
     pub(super) relative: f64,
     /// The same as `rmse`, after both were clamped and rounded to 8 bits.
     pub(super) rmse_8_bit: f64,
+    /// The mean difference to the eye, 0 to 1, of what is left in 8 bits.
+    pub(super) flip: f64,
     /// The mean, with its sign.
     pub(super) mean: f64,
     /// The largest.
@@ -22,9 +49,10 @@ pub(super) struct Errors {
 }
 
 impl Errors {
-    pub(super) fn new(pixels: &[[f32; 3]], truth: &[[f64; 3]], sampling: Sampling) -> Self {
+    /// `asked` is the error that was asked for.
+    pub(super) fn new(pixels: &[[f32; 3]], truth: &Truth, asked: Option<f64>) -> Self {
         let pairs: Vec<(f64, f64)> = (pixels.as_flattened().iter())
-            .zip(truth.as_flattened())
+            .zip(truth.pixels.as_flattened())
             .map(|(&found, &truth)| (f64::from(found), truth))
             .collect();
         let mean_of = |of: &dyn Fn(f64, f64) -> f64| {
@@ -35,14 +63,12 @@ impl Errors {
         let mut sizes: Vec<f64> =
             pairs.iter().map(|(found, truth)| (found - truth).abs()).collect();
         sizes.sort_by(f64::total_cmp);
-        let asked = match sampling {
-            Sampling::Adaptive { error, .. } => Some(error),
-            Sampling::Fixed(_) => None,
-        };
         Self {
             rmse: mean_of(&|found, truth| square(found - truth)).sqrt(),
             relative: mean_of(&|found, truth| square(found - truth) / (truth * truth + 0.01)),
             rmse_8_bit: mean_of(&|found, truth| square(step(found) - step(truth))).sqrt(),
+            flip: Seen::new(&in_8_bits(pairs.iter().map(|pair| pair.0)), truth.size)
+                .mean_difference(&truth.seen),
             mean: mean_of(&|found, truth| found - truth),
             worst: sizes[sizes.len() - 1],
             high: sizes[(sizes.len() * 999 / 1000).min(sizes.len() - 1)],
@@ -54,11 +80,41 @@ impl Errors {
     }
 }
 
+/// Where the middle of some values lies, and the middle half of them.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Spread {
+    pub(super) low: f64,
+    pub(super) median: f64,
+    pub(super) high: f64,
+}
+
+impl Spread {
+    /// There is one value at least.
+    pub(super) fn new(values: &[f64]) -> Self {
+        let mut sorted = values.to_vec();
+        sorted.sort_by(f64::total_cmp);
+        let at = |quarters: usize| sorted[(quarters * (sorted.len() - 1) + 2) / 4];
+        Self { low: at(1), median: at(2), high: at(3) }
+    }
+}
+
+/// The median and, in brackets, the quartiles: three digits of each.
+impl fmt::Display for Spread {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let digits = decimals(self.median);
+        let Self { low, median, high } = self;
+        write!(f, "{median:.digits$} ({low:.digits$}–{high:.digits$})")
+    }
+}
+
+/// How many show three digits of a number from 1 up.
+pub(super) fn decimals(number: f64) -> usize {
+    [100.0, 10.0].iter().filter(|&&size| number < size).count()
+}
+
 /// The middle one.
-pub(super) fn median(values: impl IntoIterator<Item = f64>) -> f64 {
-    let mut values: Vec<f64> = values.into_iter().collect();
-    values.sort_by(f64::total_cmp);
-    values[values.len() / 2]
+pub(super) fn median(values: &[f64]) -> f64 {
+    Spread::new(values).median
 }
 
 /// The mean and half the width of its 95 % band, by the normal law.
@@ -92,15 +148,23 @@ mod tests {
 
     #[test]
     fn errors_are_those_of_a_picture_worked_out_by_hand() {
-        let (found, truth) = ([[0.5, 0.5, 2.0]], [[0.5, 0.0, 1.5]]);
-        let sampling = Sampling::Adaptive { error: 0.1, most: 8 };
-        let errors = Errors::new(&found, &truth, sampling);
+        let truth = Truth::new(vec![[0.5, 0.0, 1.5]], Size::new(1, 1).unwrap());
+        let found = [[0.5, 0.5, 2.0]];
+        let errors = Errors::new(&found, &truth, Some(0.1));
         assert!((errors.rmse - (0.5_f64 / 3.0).sqrt()).abs() < 1e-15);
         assert!((errors.relative - (25.0 + 0.25 / 2.26) / 3.0).abs() < 1e-12);
         // What is brighter than white is white.
         let half = 128.0 / 255.0;
         assert!((errors.rmse_8_bit - f64::sqrt(half * half / 3.0)).abs() < 1e-15);
         assert_eq!((errors.worst, errors.wrongly_stopped), (0.5, Some(2.0 / 3.0)));
+    }
+
+    #[test]
+    fn a_spread_is_the_median_and_the_quartiles() {
+        let spread = Spread::new(&[9.0, 1.0, 3.0, 5.0, 7.0]);
+        assert_eq!(spread, Spread { low: 3.0, median: 5.0, high: 7.0 });
+        assert_eq!(spread.to_string(), "5.00 (3.00–7.00)");
+        assert_eq!(Spread::new(&[123.4]).to_string(), "123 (123–123)");
     }
 
     #[test]

@@ -222,6 +222,15 @@ pub fn area(outline: &[DVec2]) -> f64 {
     rest.windows(2).map(|pair| (pair[0] - first).perp_dot(pair[1] - first)).sum::<f64>() / 2.0
 }
 
+/// The share of a checkerboard's bright squares, of half a unit, between two coordinates along a
+/// row of them that starts dark or bright at 0.
+pub fn bright_share(from: f64, to: f64, starts_dark: bool) -> f64 {
+    // Bright where the fraction is 0.5 or more.
+    let up_to = |x: f64| x.floor() * 0.5 + (x - x.floor() - 0.5).max(0.0);
+    let share = (up_to(to) - up_to(from)) / (to - from);
+    if starts_dark { share } else { 1.0 - share }
+}
+
 fn pixel_corners(x: u32, y: u32) -> [DVec2; 4] {
     let corner = DVec2::new(f64::from(x), f64::from(y));
     [corner, corner + DVec2::X, corner + DVec2::ONE, corner + DVec2::Y]

@@ -7,9 +7,9 @@ mod light;
 mod refraction;
 
 pub use coverage::{
-    Ellipse, area, clip_to_pixel, polygon_coverage, polygon_outline, sphere_outline,
+    Ellipse, area, bright_share, clip_to_pixel, polygon_coverage, polygon_outline, sphere_outline,
 };
 pub use light::{
     integrating_sphere_bounce, irradiance, one_bounce_from_disc, patch_to_polygon, patch_to_sphere,
 };
-pub use refraction::{ball_deviation, slab_shift};
+pub use refraction::{ball_deviation, slab_screen_radius, slab_shift};

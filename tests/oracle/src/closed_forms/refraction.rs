@@ -15,6 +15,24 @@ pub fn ball_deviation(angle: f64, ratio: f64) -> f64 {
     2.0 * (angle - (ratio * angle.sin()).asin())
 }
 
+/// How large a ball is seen through a slab, both square to the same axis through the eye: the
+/// radius of its outline at distance 1. `distance` is from the eye to the ball's middle, the slab
+/// somewhere between them, `ratio` n1/n2 from outside to inside.
+pub fn slab_screen_radius(distance: f64, radius: f64, thickness: f64, ratio: f64) -> f64 {
+    let tangent = |sine: f64| sine / ((1.0 - sine) * (1.0 + sine)).sqrt();
+    // How far from the ball's middle a ray passes: it grows with the angle.
+    let miss = |sine: f64| {
+        let aside = (distance - thickness) * tangent(sine) + thickness * tangent(ratio * sine);
+        aside * ((1.0 - sine) * (1.0 + sine)).sqrt()
+    };
+    let (mut low, mut high) = (0.0, 1.0 - f64::EPSILON);
+    for _ in 0..100 {
+        let middle = f64::midpoint(low, high);
+        if miss(middle) < radius { low = middle } else { high = middle }
+    }
+    tangent(low)
+}
+
 #[cfg(test)]
 mod tests {
     use std::f64::consts::FRAC_PI_3;
@@ -29,5 +47,7 @@ mod tests {
         // sin 30° / cos 30°.
         assert!((slab_shift(1.0, FRAC_PI_3, ratio) - ratio).abs() < 1e-15);
         assert_eq!(slab_shift(1.0, 0.7, 1.0), 0.0);
+        // Without bending, the tangent of the angle whose sine is 3 / 5.
+        assert!((slab_screen_radius(5.0, 3.0, 1.0, 1.0) - 0.75).abs() < 1e-15);
     }
 }
