@@ -593,12 +593,18 @@ impl Faces {
         self.shared.push(plane);
     }
 
-    /// The plane through the mean corner with Newell's normal.
+    /// The plane with Newell's normal through a triangle's first corner, which is in it exactly, or
+    /// through the mean corner of a quadrangle, whose corners may be only nearly in one plane.
     fn plane_of(&self, face: usize) -> PlaneRecord {
         let corners = self.corners(face);
-        let from_first: DVec3 = corners.iter().map(|&corner| corner - corners[0]).sum();
-        let mean = corners[0] + from_first / corners.len() as f64;
-        PlaneRecord { point: mean.to_array(), normal: self.normal_of(face).to_array() }
+        let point = match corners {
+            [first, _, _] => *first,
+            _ => {
+                let from_first: DVec3 = corners.iter().map(|&corner| corner - corners[0]).sum();
+                corners[0] + from_first / corners.len() as f64
+            }
+        };
+        PlaneRecord { point: point.to_array(), normal: self.normal_of(face).to_array() }
     }
 
     /// The unit normal of a flat face.

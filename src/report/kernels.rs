@@ -9,7 +9,7 @@ use rtfarm_core::{
     prepare::prepare,
     prepared::{PreparedBytes, PreparedScene},
     scene::{Material, Scene, Triangle, Viewport},
-    trace::Probe,
+    trace::{FaceTests, Probe},
 };
 use rtfarm_oracle::{Oracle, random::Random};
 use tokio::time::Instant;
@@ -60,6 +60,8 @@ pub(super) struct Case {
     pub(super) moved: f64,
     pub(super) aim: Aim,
     pub(super) rays: Vec<Probe>,
+    /// What our own kernels did for them.
+    pub(super) tests: FaceTests,
     /// No kernel in single precision can hold the mesh otherwise.
     pub(super) is_single: bool,
     pub(super) kernels: Vec<Kernel>,
@@ -220,7 +222,8 @@ impl Case {
 
     pub(super) fn new(mesh: &Mesh, aim: Aim, count: usize) -> Self {
         let (rays, is_single) = (mesh.rays(aim, count), mesh.is_single);
-        Self { moved: mesh.moved, aim, rays, is_single, kernels: Vec::new() }
+        let tests = FaceTests::default();
+        Self { moved: mesh.moved, aim, rays, tests, is_single, kernels: Vec::new() }
     }
 
     /// All that are there to be measured, in a folder for other programs.
@@ -232,6 +235,7 @@ impl Case {
     fn measure(&mut self, mesh: &Mesh, prepared: &PreparedScene<PreparedBytes>, amount: Amount) {
         let isas: Vec<Isa> = Isa::ALL.into_iter().filter(|isa| isa.is_supported()).collect();
         let truth = truth(mesh, &self.rays, amount.exact);
+        self.tests = prepared.count_face_tests(&self.rays);
         let mut speeds = vec![Vec::new(); isas.len()];
         for _ in 0..amount.runs {
             for (isa, speeds) in isas.iter().zip(&mut speeds) {

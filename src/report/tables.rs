@@ -274,7 +274,9 @@ fn kernels(cases: &[Case], amount: Amount) -> String {
          each that meets nothing is a leak. Up to 1e5 the mesh's corners and the rays' origins are \
          rounded to f32 first, so that every kernel gets the same; kernels in f32 get directions \
          rounded to it, and their truth is that of the rounded ray. Truth is exact arithmetic, for \
-         {} rays of each row. The textbook's tests, in the form that leaves no margin, try every \
+         {} rays of each row. Of rtfarm's tests of a ray against a \
+         face those are in doubt for which it asks for the digits that f64 products lose. The \
+         textbook's tests, in the form that leaves no margin, try every \
          face, so they have no speed.\n\n![kernels]({})\n\n",
         amount.exact,
         plot::KERNEL_FILE
@@ -294,8 +296,11 @@ fn kernels(cases: &[Case], amount: Amount) -> String {
     text += "Largest relative error of a distance:\n\n";
     text += &kernel_table(cases, &all, &[], &|kernel| format!("{:.1e}", kernel.worst));
     text += "Leaks among a million rays:\n\n";
-    // The share of rays that exact arithmetic decides belongs here: a column of the case's own.
-    let own: [Column<'_>; 1] = [("rays", &|case: &Case| case.rays.len().to_string())];
+    let in_doubt = |case: &Case| {
+        format!("{:.2} %", 100.0 * case.tests.in_doubt as f64 / case.tests.all as f64)
+    };
+    let own: [Column<'_>; 2] =
+        [("rays", &|case: &Case| case.rays.len().to_string()), ("tests in doubt", &in_doubt)];
     text += &kernel_table(cases, &all, &own, &|kernel| {
         format!("{:.0}", 1e6 * kernel.leaks as f64 / kernel.rays as f64)
     });
