@@ -207,9 +207,15 @@ fn scenes_of_any_size_are_met_within_a_millionth_of_a_millionth() {
     tell(
         7,
         "scenes scaled by 1e-12 and 1e12, 1e-100 and 1e100 are met at the oracle's t",
-        format!("{} hits, relative error {:.1e}", total.hits, total.relative),
+        // Relative to a t that is tiny beside the coordinates nothing can be exact.
+        format!(
+            "{} hits, error {:.1e} of max(|o|, t); {:.1e} of t alone",
+            total.hits,
+            total.steep * f64::EPSILON,
+            total.relative
+        ),
     );
-    assert!(total.relative <= 1e-12 && total.close * 5 <= total.same, "{total:?}");
+    assert!(total.steep * f64::EPSILON <= 1e-13 && total.close * 5 <= total.same, "{total:?}");
 }
 
 #[test]
@@ -448,7 +454,8 @@ fn check_energy(
         &format!("{what} of {area:.0e} pixels have their energy"),
         format!("{off:+.2} sigma: {seen:.0} samples hit of {covered:.0} expected"),
     );
-    assert!(off.abs() <= 3.0, "{what}: {seen}, truly {covered}");
+    // Of 370 seeds one is beyond 3 sigma; of 15 000 beyond 4.
+    assert!(off.abs() <= 4.0, "{what}: {seen}, truly {covered}");
 }
 
 #[test]
@@ -644,7 +651,8 @@ fn a_quadrangle_with_three_corners_in_a_line_is_a_triangle() {
         let mut corners = [a, b, middle, c];
         corners.rotate_left(seed as usize % 4);
         let flat = opened(&of_quadrangles(&[corners]));
-        let triangle = opened(&of_triangles(&[[a, b, c]]));
+        let scene = of_triangles(&[[a, b, c]]);
+        let (triangle, oracle) = (opened(&scene), Oracle::new(&scene));
         let probes: Vec<Probe> = (0..rays(100_000) / 100)
             .map(|k| {
                 let (u, v) = (random.between(-0.1, 1.1), random.between(-0.1, 1.1));
@@ -659,9 +667,7 @@ fn a_quadrangle_with_three_corners_in_a_line_is_a_triangle() {
             if found[k].is_some() != truth.is_some() {
                 // The corner in between is rounded on its way to the screen, as all corners are.
                 let Probe { origin, direction, .. } = probes[k];
-                let across = (c - b).cross(direction).normalize();
-                let distance = (origin - b).dot(across).abs();
-                farthest = farthest.max(distance / (f64::EPSILON * origin.length()));
+                farthest = farthest.max(oracle.miss_margin(origin, direction, None));
                 close += 1;
             }
             if let (Some(found), Some(truth)) = (found[k], truth) {
@@ -678,10 +684,10 @@ fn a_quadrangle_with_three_corners_in_a_line_is_a_triangle() {
         "a quadrangle with three corners in a line has the triangle's hits",
         format!(
             "{count} rays, {hits} hits, t within {worst:.1} ulp across the face; {close} of the \
-             rays at the halved edge fall to its other side, {farthest:.1} ulp of |o| from it at most"
+             rays at the halved edge fall to its other side, {farthest:.1e} from it at most"
         ),
     );
-    assert!(worst <= 8.0 && farthest <= 8.0);
+    assert!(worst <= 8.0 && farthest <= 16.0 * f64::EPSILON);
 }
 
 #[test]

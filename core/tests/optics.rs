@@ -797,7 +797,9 @@ fn an_eye_inside_glass_or_a_solid_sees_what_the_oracle_sees() {
         ("a shell's wall", join("difference", &[&cube(1.2, "glass"), &ball(DVec3::X, 0.9)])),
     ] {
         let scene = scene(materials, lights, &(around.clone() + &geometry));
-        let side = few_rays(400).isqrt() as u64;
+        // A multiple of four: no pixel's middle has a slope of 0 or 1/2, at which rays that are
+        // mirrored in these boxes come upon an edge.
+        let side = few_rays(400).isqrt() as u64 & !3;
         let differing = difference_from_oracle(&scene, side);
         assert!(differing * 500 <= (side * side) as usize, "{what}: {differing} pixels differ");
         count += side * side;
