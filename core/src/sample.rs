@@ -83,7 +83,7 @@ impl GatherNumbers {
     /// What it aims at. A choice among many needs more than the 23 bits of a number.
     pub(crate) fn choice(&self) -> f64 {
         let [choice] = self.0.numbers(2, self.0.key);
-        choice + self.fraction(0) * (1.0 / (1 << 23) as f64)
+        choice + self.fraction(0) * (1.0 / f64::from(1 << 23))
     }
 
     /// Its direction.
