@@ -1,7 +1,8 @@
 //! Features whose code this build leaves out, to count what that code costs scenes without them.
 //!
-//! `RTFARM_BUILD_WITHOUT=textures` in the compiler's environment leaves textures out; such a build
-//! shows scenes as if they had none. `benches/ablation.rs` makes these builds; no other is one.
+//! `RTFARM_BUILD_WITHOUT=texture` in the compiler's environment leaves textures out: such a build
+//! shows scenes as if they had none. Records keep their layout. `benches/ablation.rs` makes these
+//! builds; no other is one.
 
 /// The feature whose code this build leaves out.
 pub const BUILT_WITHOUT: Option<&str> = option_env!("RTFARM_BUILD_WITHOUT");
@@ -17,6 +18,12 @@ pub(crate) const TRANSPARENCY: bool = is_left_out(FEATURES[3]);
 pub(crate) const REFRACTION: bool = is_left_out(FEATURES[4]);
 pub(crate) const TEXTURE: bool = is_left_out(FEATURES[5]);
 pub(crate) const SOLID: bool = is_left_out(FEATURES[6]);
+
+const _: () = assert!(
+    BUILT_WITHOUT.is_none()
+        || (AMBIENT || MIRROR || SECONDARY_LIGHT || TRANSPARENCY || REFRACTION || TEXTURE || SOLID),
+    "no feature has the name that RTFARM_BUILD_WITHOUT gives"
+);
 
 const fn is_left_out(feature: &str) -> bool {
     let Some(without) = BUILT_WITHOUT else { return false };

@@ -95,7 +95,7 @@ pub(crate) struct Features {
 impl Features {
     /// Light is looked for where emitters are, as well as all over the sky.
     pub(crate) const AIMED: u32 = 1;
-    /// Only all over the sky.
+    /// Only all over the sky, by one ray from each place: the yardstick.
     pub(crate) const UNAIMED: u32 = 2;
 
     pub(crate) fn has_branches(&self) -> bool {
