@@ -597,12 +597,11 @@ impl Faces {
     /// through the mean corner of a quadrangle, whose corners may be only nearly in one plane.
     fn plane_of(&self, face: usize) -> PlaneRecord {
         let corners = self.corners(face);
-        let point = match corners {
-            [first, _, _] => *first,
-            _ => {
-                let from_first: DVec3 = corners.iter().map(|&corner| corner - corners[0]).sum();
-                corners[0] + from_first / corners.len() as f64
-            }
+        let point = if corners.len() == 3 {
+            corners[0]
+        } else {
+            let from_first: DVec3 = corners.iter().map(|&corner| corner - corners[0]).sum();
+            corners[0] + from_first / corners.len() as f64
         };
         PlaneRecord { point: point.to_array(), normal: self.normal_of(face).to_array() }
     }
