@@ -92,7 +92,8 @@ struct Score {
     /// where the ray is steeper than 60° to the face, and across the face at any angle.
     steep: f64,
     across: f64,
-    /// Of steep rays, relative to t.
+    /// Of steep rays, relative to a t that is at least a hundredth of the origin's greatest
+    /// coordinate.
     relative: f64,
 }
 
@@ -125,13 +126,14 @@ fn compare(scene: &Scene, probes: &[Probe], what: &str) -> Score {
         let ulp = f64::EPSILON * truth.t.max(probe.origin.abs().max_element());
         let cosine = truth.normal.dot(probe.direction).abs();
         let is_steep = cosine > 0.5;
+        let is_long = truth.t > probe.origin.abs().max_element() / 100.0;
         Score {
             same: 1,
             hits: 1,
             close: 0,
             steep: if is_steep { error / ulp } else { 0.0 },
             across: error * cosine / ulp,
-            relative: if is_steep { error / truth.t } else { 0.0 },
+            relative: if is_steep && is_long { error / truth.t } else { 0.0 },
         }
     };
     probes.par_iter().zip(found).map(score).reduce(Score::default, Score::join)
@@ -209,13 +211,14 @@ fn scenes_of_any_size_are_met_within_a_millionth_of_a_millionth() {
         "scenes scaled by 1e-12 and 1e12, 1e-100 and 1e100 are met at the oracle's t",
         // Relative to a t that is tiny beside the coordinates nothing can be exact.
         format!(
-            "{} hits, error {:.1e} of max(|o|, t); {:.1e} of t alone",
+            "{} hits, error {:.1e} of max(|o|, t); {:.1e} of t from a hundredth of |o| on",
             total.hits,
             total.steep * f64::EPSILON,
             total.relative
         ),
     );
-    assert!(total.steep * f64::EPSILON <= 1e-13 && total.close * 5 <= total.same, "{total:?}");
+    assert!(total.relative <= 1e-12 && total.steep * f64::EPSILON <= 1e-13, "{total:?}");
+    assert!(total.close * 5 <= total.same, "{total:?}");
 }
 
 #[test]
@@ -454,8 +457,9 @@ fn check_energy(
         &format!("{what} of {area:.0e} pixels have their energy"),
         format!("{off:+.2} sigma: {seen:.0} samples hit of {covered:.0} expected"),
     );
-    // Of 370 seeds one is beyond 3 sigma; of 15 000 beyond 4.
-    assert!(off.abs() <= 4.0, "{what}: {seen}, truly {covered}");
+    // Case 19 holds to 3 sigma. Case 33 asks for no number of them: one seed in 370 is beyond 3.
+    let most = if case == 19 { 3.0 } else { 4.0 };
+    assert!(off.abs() <= most, "{what}: {seen}, truly {covered}");
 }
 
 #[test]
@@ -687,7 +691,7 @@ fn a_quadrangle_with_three_corners_in_a_line_is_a_triangle() {
              rays at the halved edge fall to its other side, {farthest:.1e} from it at most"
         ),
     );
-    assert!(worst <= 8.0 && farthest <= 16.0 * f64::EPSILON);
+    assert!(worst <= 8.0 && farthest <= 4.0 * f64::EPSILON);
 }
 
 #[test]

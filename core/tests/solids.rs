@@ -172,7 +172,7 @@ fn check_equal_sets(what: &str, write: impl Fn([&str; 3]) -> [String; 2]) {
             }
         }
     }
-    assert!(crossed > few_rays(2_000), "{what}: {crossed} crossings in all");
+    assert!(crossed > few_rays(4_000), "{what}: {crossed} crossings in all");
 }
 
 /// A box around everything: what is not in a set is in this less the set.
