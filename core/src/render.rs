@@ -2,8 +2,8 @@
 //!
 //! A pixel's samples are added in their own order, and each is a pure function of (scene,
 //! settings, pixel, sample); how many there are hangs on the first samples of the pixel and its
-//! eight neighbours, on the faces in its beam, and on its own later samples. So a pixel is the same to the bit whatever the
-//! tile, the batch, the thread or the CPU.
+//! eight neighbours, on the faces in its beam, and on its own later samples. So a pixel is the same
+//! to the bit whatever the tile, the batch, the thread or the CPU.
 
 use std::ops::{ControlFlow, RangeInclusive};
 
