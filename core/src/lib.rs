@@ -3,59 +3,33 @@
 //!
 //! Nothing here opens files, reads a clock, uses sockets or starts threads other than rayon's.
 
+// What every room may speak of.
+mod exact;
+pub mod isa;
+pub mod left_out;
+pub mod sample;
 pub mod scene;
+mod text;
+pub mod tile;
 pub mod transfer;
 
 // Text into a scene.
-mod block;
-mod diagnostic;
-mod exact;
-mod hash;
-mod lexer;
-pub mod mesh_file;
-mod number;
-mod obj;
-mod ply;
-mod polygon;
-pub mod read;
-mod shapes;
-mod stl;
-mod symbol;
-pub mod texture;
-mod triangles;
+pub mod assets;
+pub mod language;
 
 // A scene into a prepared scene.
-mod bvh;
-mod emitter_tree;
-mod emitters;
-mod node;
-mod plane;
 pub mod prepare;
 pub mod prepared;
-mod pyramid;
-mod weld;
 
 // A prepared scene into tiles.
-mod beam;
-mod emitter;
-mod gather;
-pub mod isa;
-pub mod left_out;
+mod light;
 pub mod picture;
-mod pixel;
-mod quadrangle;
-mod ray;
 pub mod render;
-pub mod sample;
-mod solid;
-mod sphere;
-mod spread;
-mod texcoord;
-mod texture_sampling;
-pub mod tile;
+mod shade;
 pub mod trace;
-mod triangle;
-mod wavefront;
+
+pub use assets::{mesh as mesh_file, texture};
+pub use language::reader as read;
 
 #[cfg(test)]
 #[path = "../tests/long/mod.rs"]

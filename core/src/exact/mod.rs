@@ -1,0 +1,5 @@
+//! Arithmetic without rounding, and decisions that rest on it.
+
+pub(crate) mod hash;
+pub(crate) mod polygon;
+pub(crate) mod predicates;

@@ -1,0 +1,5 @@
+//! Light that faces send on to others.
+
+pub(crate) mod gather;
+pub(crate) mod sampling;
+pub(crate) mod tree;

@@ -1,0 +1,209 @@
+//! Which faces of a scene send light on, and about how much.
+
+use glam::{DVec2, DVec3};
+
+use crate::{
+    light::tree::{NO_NODE, Twig, build_tree},
+    prepared::{EmitterNode, EmitterRecord, LightRecord, MaterialRecord},
+};
+
+/// The most lights that are asked about one face; of more, every second, third and so on stands
+/// for those between.
+const MOST_LIGHTS: usize = 256;
+
+/// Takes in faces, in any order, and keeps those that send light on.
+pub(crate) struct Emitters<'a> {
+    materials: &'a [MaterialRecord],
+    lights: &'a [LightRecord],
+    ambient: DVec3,
+    found: Vec<(EmitterRecord, Twig)>,
+}
+
+impl<'a> Emitters<'a> {
+    pub(crate) fn new(
+        materials: &'a [MaterialRecord],
+        lights: &'a [LightRecord],
+        ambient: DVec3,
+    ) -> Self {
+        Self { materials, lights, ambient, found: Vec::new() }
+    }
+
+    pub(crate) fn is_one(&self, material: u32) -> bool {
+        self.materials[material as usize].emits()
+    }
+
+    /// A triangle or a simple quadrangle.
+    pub(crate) fn add_polygon(
+        &mut self,
+        (material, rank): (u32, u32),
+        vertices: &[u32],
+        all_vertices: &[[f64; 3]],
+    ) {
+        if !self.is_one(material) {
+            return;
+        }
+        let mut vertices: [u32; 4] = std::array::from_fn(|k| vertices[k.min(vertices.len() - 1)]);
+        let mut corners = vertices.map(|vertex| DVec3::from_array(all_vertices[vertex as usize]));
+        let turned_area = 0.5 * (corners[2] - corners[0]).cross(corners[3] - corners[1]);
+        let area = turned_area.length();
+        if area == 0.0 {
+            return; // Below what numbers hold: nothing can be aimed at it.
+        }
+        // The diagonal between the first and the third corner is to be the one inside.
+        let [b, c, d] = [1, 2, 3].map(|k| corners[k] - corners[0]);
+        if b.cross(c).dot(turned_area) < 0.0 || c.cross(d).dot(turned_area) < 0.0 {
+            vertices.rotate_left(1);
+            corners.rotate_left(1);
+        }
+        let is_triangle = vertices[2] == vertices[3];
+        let outline = &corners[..if is_triangle { 3 } else { 4 }];
+        let middle = outline.iter().sum::<DVec3>() / outline.len() as f64;
+        let mut received = [DVec3::ZERO; 2];
+        for (light, times) in self.some_lights() {
+            let position = DVec3::from_array(light.position);
+            for &corner in outline {
+                let to_light = position - (middle + 0.8 * (corner - middle));
+                let height = turned_area.dot(to_light) / area;
+                let distance = to_light.length();
+                if distance > 0.0 {
+                    let share = height.abs() / (distance * distance * distance);
+                    received[usize::from(height < 0.0)] +=
+                        DVec3::from_array(light.intensity) * (share * times / outline.len() as f64);
+                }
+            }
+        }
+        let reach = |&corner: &DVec3| (corner - middle).length();
+        let radius = outline.iter().map(reach).fold(0.0, f64::max);
+        let record = EmitterRecord {
+            middle: middle.to_array(),
+            turned_area: turned_area.to_array(),
+            size: area,
+            radiosity: received.map(|light| self.radiosity(material, light)),
+            vertices,
+            rank,
+            shape: if is_triangle { EmitterRecord::TRIANGLE } else { EmitterRecord::QUADRANGLE },
+            node: NO_NODE,
+            by_size: 0,
+        };
+        self.found.push((record, Twig { center: middle, radius, area }));
+    }
+
+    /// A sphere: only its outside is aimed at.
+    pub(crate) fn add_sphere(
+        &mut self,
+        (material, rank): (u32, u32),
+        center: [f64; 3],
+        radius: f64,
+    ) {
+        if !self.is_one(material) {
+            return;
+        }
+        let center = DVec3::from_array(center);
+        let mut received = DVec3::ZERO;
+        for (light, times) in self.some_lights() {
+            let distance = (DVec3::from_array(light.position) - center).length();
+            if distance > radius {
+                // What falls on it, spread over its surface.
+                let sine = radius / distance;
+                let cosine = ((1.0 - sine) * (1.0 + sine)).sqrt();
+                let share = 0.5 / (distance * distance * (1.0 + cosine));
+                received += DVec3::from_array(light.intensity) * (share * times);
+            } else {
+                // Seen from outside through it, or where a solid has no such face.
+                received += DVec3::from_array(light.intensity) * (times / (radius * radius));
+            }
+        }
+        let record = EmitterRecord {
+            middle: center.to_array(),
+            turned_area: [0.0; 3],
+            size: radius,
+            radiosity: [self.radiosity(material, received); 2],
+            vertices: [0; 4],
+            rank,
+            shape: EmitterRecord::SPHERE,
+            node: NO_NODE,
+            by_size: 0,
+        };
+        let area = 4.0 * std::f64::consts::PI * (radius * radius);
+        self.found.push((record, Twig { center, radius, area }));
+    }
+
+    /// All, by their ranks, and the tree over them.
+    pub(crate) fn finish(mut self) -> (Vec<EmitterRecord>, Vec<EmitterNode>) {
+        self.found.sort_unstable_by_key(|(record, _)| record.rank);
+        let (mut emitters, twigs): (Vec<_>, Vec<_>) = self.found.into_iter().unzip();
+        let mut by_size: Vec<u32> = (0..emitters.len() as u32).collect();
+        by_size.sort_by(|&a, &b| twigs[b as usize].area.total_cmp(&twigs[a as usize].area));
+        for (emitter, by_size) in emitters.iter_mut().zip(by_size) {
+            emitter.by_size = by_size;
+        }
+        let nodes = build_tree(&mut emitters, &twigs);
+        (emitters, nodes)
+    }
+
+    /// Lights that stand for all, and for how many each.
+    fn some_lights(&self) -> impl Iterator<Item = (&'a LightRecord, f64)> {
+        let step = self.lights.len().div_ceil(MOST_LIGHTS).max(1);
+        self.lights.iter().step_by(step).map(move |light| (light, step as f64))
+    }
+
+    /// What a face sends on in its brightest channel where it receives this from the lights.
+    fn radiosity(&self, material: u32, light: DVec3) -> f64 {
+        let material = &self.materials[material as usize];
+        let sent = DVec3::from_array(material.color) * (self.ambient + light);
+        (material.reflect * material.alpha * sent.max_element()).min(1e100)
+    }
+}
+
+/// The smaller of a ball and the one around `bounds`: a solid's face on the ball lies in both.
+pub(crate) fn smaller_ball(center: DVec3, radius: f64, (min, max): (DVec3, DVec3)) -> (DVec3, f64) {
+    let around = (max - min).length() / 2.0;
+    if around > 0.0 && around < radius {
+        (min + (max - min) / 2.0, around)
+    } else {
+        (center, radius)
+    }
+}
+
+/// The part of a parallelogram, cut along its sides, that holds what lies within `bounds`; `None`
+/// where nothing does.
+pub(crate) fn within(corners: &[DVec3], (min, max): (DVec3, DVec3)) -> Option<[DVec3; 4]> {
+    let (start, right, up) = (corners[0], corners[1] - corners[0], corners[3] - corners[0]);
+    // What lies on a bound is within it, whatever the rounding.
+    let slack = 1e-9 * max.abs().max(min.abs()).max_element();
+    let (min, max) = (min - slack, max + slack);
+    // Places as shares of the two sides.
+    let mut outline = vec![DVec2::ZERO, DVec2::X, DVec2::ONE, DVec2::Y];
+    for axis in 0..3 {
+        for (bound, sign) in [(min[axis], 1.0), (max[axis], -1.0)] {
+            let height =
+                |at: DVec2| sign * (start[axis] + at.x * right[axis] + at.y * up[axis] - bound);
+            outline = clip(&outline, height);
+        }
+    }
+    let none = (DVec2::ONE, DVec2::ZERO);
+    let (low, high) = outline.iter().fold(none, |(low, high), &at| (low.min(at), high.max(at)));
+    let (low, high) = ((low - 1e-9).max(DVec2::ZERO), (high + 1e-9).min(DVec2::ONE));
+    low.cmplt(high).all().then(|| {
+        [(low.x, low.y), (high.x, low.y), (high.x, high.y), (low.x, high.y)]
+            .map(|(x, y)| start + x * right + y * up)
+    })
+}
+
+/// The part of a convex outline where `height` is not below 0.
+///
+/// Source: Sutherland & Hodgman, "Reentrant Polygon Clipping" (1974).
+fn clip(outline: &[DVec2], height: impl Fn(DVec2) -> f64) -> Vec<DVec2> {
+    let mut clipped = Vec::new();
+    for (k, &p) in outline.iter().enumerate() {
+        let q = outline[(k + 1) % outline.len()];
+        let (at_p, at_q) = (height(p), height(q));
+        if at_p >= 0.0 {
+            clipped.push(p);
+        }
+        if (at_p >= 0.0) != (at_q >= 0.0) {
+            clipped.push(p + (q - p) * (at_p / (at_p - at_q)));
+        }
+    }
+    clipped
+}

@@ -1,0 +1,5 @@
+//! What a surface looks like where a ray meets it.
+
+pub(crate) mod chart;
+pub(crate) mod ray_differential;
+pub(crate) mod texture;

@@ -1,0 +1,290 @@
+//! What a sample sees of an image: its mean over the part that belongs to the sample.
+
+use glam::{DVec2, DVec3};
+
+use super::{chart::Chart, ray_differential::Patch};
+use crate::{
+    prepare::mip_maps::LevelRecord,
+    prepared::{TexturedFace, View},
+    trace::ray::{Hit, Kind},
+};
+
+/// The most probes along a footprint's longer axis, and so how much longer than wide a footprint
+/// may be that is not blurred.
+const MOST_PROBES: f64 = 32.0;
+
+/// How near the far end of a footprint is taken to be, of its middle, at the horizon.
+const LEAST_NEARNESS: f64 = 1.0 / 64.0;
+
+/// A part of an image, in texture coordinates: see [`Patch`].
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Footprint {
+    pub(crate) center: DVec2,
+    pub(crate) sides: [DVec2; 2],
+    pub(crate) tapers: [f64; 2],
+}
+
+/// What multiplies the colour of a face at a hit: its texture, of which the sample sees `patch`.
+/// White where the face has no texture coordinates.
+pub(crate) fn texture_color(
+    view: &View<'_>,
+    texture: u32,
+    hit: &Hit,
+    (position, outward): (DVec3, DVec3),
+    patch: Patch,
+) -> DVec3 {
+    let faces = view.textured_faces;
+    let Ok(face) = faces.binary_search_by_key(&hit.rank, |face| face.rank) else {
+        return DVec3::ONE;
+    };
+    let TexturedFace { texcoords, .. } = faces[face];
+    let index = hit.item.index();
+    let to_vectors = |corner: &[f64; 3]| DVec3::from_array(*corner);
+    let chart = match hit.item.kind() {
+        Some(Kind::Triangle) => {
+            Chart::new(&view.corners(&view.triangles[index].vertices).map(to_vectors), outward)
+        }
+        Some(Kind::Coplanar) => {
+            Chart::new(&view.corners(&view.coplanars[index].vertices).map(to_vectors), outward)
+        }
+        Some(Kind::Quadrangle) => {
+            Chart::new(&view.corners(&view.quadrangles[index].vertices).map(to_vectors), outward)
+        }
+        Some(Kind::Sphere | Kind::Solid) | None => return DVec3::ONE,
+    };
+    let place = chart.place(position);
+    let footprint = Footprint {
+        center: texcoords.at(place),
+        sides: patch.sides.map(|side| texcoords.step(place, chart.step(place, side))),
+        tapers: patch.tapers,
+    };
+    view.texture(texture).mean(&footprint)
+}
+
+/// A texture that can be looked at.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct TextureView<'a> {
+    pub(crate) levels: &'a [LevelRecord],
+    pub(crate) fine: &'a [[u8; 4]],
+    /// What their bytes stand for, in 255ths.
+    pub(crate) light_of_bytes: &'a [f64; 256],
+    pub(crate) coarse: &'a [[f32; 3]],
+}
+
+impl TextureView<'_> {
+    /// The mean over a footprint, nearly: probes along its longer axis, each as wide as its shorter
+    /// one is there. A footprint within a texel gives the image itself, bilinear between the middles
+    /// of texels.
+    pub(crate) fn mean(&self, footprint: &Footprint) -> DVec3 {
+        // Source: McCormack, Perry, Farkas & Jouppi, "Feline: Fast Elliptical Lines for Anisotropic
+        // Texture Mapping" (1999), but with the axes of the footprint's own ellipse, equal weights,
+        // which fit a pixel's square, and probes at equal distances on the screen, not the image.
+        let size = self.size();
+        let [a, b] = footprint.sides.map(|side| side * size);
+        // The longer axis is an eigenvector of [a b] [a b]ᵀ.
+        let (xx, xy, yy) = (a.x * a.x + b.x * b.x, a.x * a.y + b.x * b.y, a.y * a.y + b.y * b.y);
+        let half_difference = (xx - yy) / 2.0;
+        let root = (half_difference * half_difference + xy * xy).sqrt();
+        let length = ((xx + yy) * 0.5 + root).sqrt();
+        if length <= 1.0 {
+            return self.bilinear(0, footprint.center);
+        }
+        if !length.is_finite() {
+            return self.bilinear(self.levels.len() - 1, footprint.center);
+        }
+        let axis = if half_difference > 0.0 {
+            DVec2::new(half_difference + root, xy)
+        } else {
+            DVec2::new(xy, root - half_difference)
+        };
+        let axis_length = axis.length();
+        // A circle has no longer axis.
+        let direction = if axis_length > 0.0 { axis / axis_length } else { DVec2::X };
+        let minor = a.perp_dot(b).abs() / length;
+        let width = minor.max(length / MOST_PROBES).max(1.0);
+        let count = (length / width).ceil().min(MOST_PROBES);
+        // From end to end, so that a footprint grows into a second probe without a jump.
+        let step = (length - width) / (count - 1.0).max(1.0);
+        let taper = (a.dot(direction) * footprint.tapers[0]
+            + b.dot(direction) * footprint.tapers[1])
+            / (length * length);
+        let mut sum = DVec3::ZERO;
+        for k in 0..count as u32 {
+            let along = (f64::from(k) - (count - 1.0) / 2.0) * step;
+            // Beyond the horizon there is nothing to see.
+            let growth = 1.0 / (1.0 + along * taper).max(LEAST_NEARNESS);
+            let wide = (width * growth * growth).max(minor * growth).max(1.0);
+            let at = footprint.center + direction * (along * growth) / size;
+            sum += self.trilinear(wide, at);
+        }
+        sum / count
+    }
+
+    fn size(&self) -> DVec2 {
+        DVec2::new(self.levels[0].width.into(), self.levels[0].height.into())
+    }
+
+    /// Between the two levels whose texels are nearest to `width` (>= 1) of the finest ones.
+    fn trilinear(&self, width: f64, at: DVec2) -> DVec3 {
+        // The logarithm to base 2, linear between powers of two: exponent and mantissa.
+        let exponent = (width.to_bits() >> 52) as usize - 1023;
+        let mantissa = f64::from_bits(width.to_bits() & ((1 << 52) - 1) | 1023 << 52);
+        let last = self.levels.len() - 1;
+        if exponent >= last {
+            return self.bilinear(last, at);
+        }
+        let finer = self.bilinear(exponent, at);
+        if mantissa <= 1.0 {
+            return finer;
+        }
+        finer + (mantissa - 1.0) * (self.bilinear(exponent + 1, at) - finer)
+    }
+
+    /// Between the middles of four texels of a level, which repeats on all sides.
+    fn bilinear(&self, level: usize, at: DVec2) -> DVec3 {
+        let LevelRecord { width, height, offset } = self.levels[level];
+        let ([left, right], across) = neighbours(at.x, width);
+        let ([above, below], down) = neighbours(at.y, height);
+        let row = |y: usize| {
+            let start = offset as usize + y * width as usize;
+            let [left, right] = [left, right].map(|x| self.texel(level, start + x));
+            left + across * (right - left)
+        };
+        let (above, below) = (row(above), row(below));
+        let color = above + down * (below - above);
+        if level == 0 { color / 255.0 } else { color }
+    }
+
+    /// Of the finest level in 255ths, which keeps sums exact.
+    fn texel(&self, level: usize, index: usize) -> DVec3 {
+        if level == 0 {
+            let [r, g, b, _] = self.fine[index];
+            let light = |byte: u8| self.light_of_bytes[usize::from(byte)];
+            DVec3::new(light(r), light(g), light(b))
+        } else {
+            DVec3::from_array(self.coarse[index].map(f64::from))
+        }
+    }
+}
+
+/// The two of `count` texels around a coordinate, and how far it is on the way to the second.
+fn neighbours(coordinate: f64, count: u32) -> ([usize; 2], f64) {
+    let fraction = coordinate - coordinate.floor();
+    // Not NaN, nor the 1 that a tiny negative number rounds to.
+    let fraction = if fraction < 1.0 { fraction } else { 0.0 };
+    let from_first = fraction * f64::from(count) - 0.5;
+    let first = from_first.floor();
+    let last = count as usize - 1;
+    let low = if first < 0.0 { last } else { (first as usize).min(last) };
+    let high = if low == last { 0 } else { low + 1 };
+    ([low, high], from_first - first)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{prepare::mip_maps::Pyramids, scene::Texture};
+
+    fn image(width: u32, height: u32, texel: impl Fn(u32, u32) -> [u8; 3]) -> Pyramids {
+        let texels =
+            (0..height).flat_map(|y| (0..width).map(move |x| (x, y))).map(|(x, y)| texel(x, y));
+        let texture = Texture { path: String::new(), width, height, texels: texels.collect() };
+        let mut pyramids = Pyramids::default();
+        pyramids.add(&texture);
+        pyramids
+    }
+
+    fn look(pyramids: &Pyramids) -> TextureView<'_> {
+        TextureView {
+            levels: &pyramids.levels,
+            fine: &pyramids.fine,
+            light_of_bytes: pyramids.transfer.light_of_bytes(),
+            coarse: &pyramids.coarse,
+        }
+    }
+
+    fn noise(x: u32, y: u32) -> [u8; 3] {
+        let bits = (x ^ y.wrapping_mul(0x9E37_79B9)).wrapping_mul(0x85EB_CA6B);
+        [bits >> 24, bits >> 16, bits >> 8].map(|channel| channel as u8)
+    }
+
+    fn footprint(center: [f64; 2], sides: [[f64; 2]; 2]) -> Footprint {
+        Footprint {
+            center: DVec2::from_array(center),
+            sides: sides.map(DVec2::from_array),
+            tapers: [0.0; 2],
+        }
+    }
+
+    #[test]
+    fn a_point_is_bilinear_between_the_middles_of_texels() {
+        let pyramids = image(2, 2, |x, y| [255 * x as u8, 255 * y as u8, 255]);
+        let seen = |u, v| look(&pyramids).mean(&footprint([u, v], [[0.0; 2]; 2]));
+        assert_eq!(seen(0.25, 0.25), DVec3::new(0.0, 0.0, 1.0));
+        assert_eq!(seen(0.75, 0.25), DVec3::new(1.0, 0.0, 1.0));
+        assert_eq!(seen(0.25, 0.75), DVec3::new(0.0, 1.0, 1.0));
+        assert_eq!(seen(0.5, 0.375), DVec3::new(0.5, 0.25, 1.0));
+        // It repeats.
+        assert_eq!(seen(1.0, 0.25), DVec3::new(0.5, 0.0, 1.0));
+        assert_eq!(seen(-3.25, 5.75), seen(0.75, 0.75));
+        assert_eq!(seen(-1e-20, 0.25), seen(0.0, 0.25));
+    }
+
+    #[test]
+    fn nothing_is_too_large_too_long_or_no_number() {
+        let pyramids = image(5, 3, noise);
+        for bad in [f64::NAN, f64::INFINITY, -f64::INFINITY, 1e300, -1e300, 1e17, 1e-300] {
+            for at in 0..6 {
+                let mut numbers = [0.1, 0.2, 0.3, 0.4, 0.5, 0.6];
+                numbers[at] = bad;
+                let [u, v, a, b, c, d] = numbers;
+                let seen = look(&pyramids).mean(&footprint([u, v], [[a, b], [c, d]]));
+                assert!((0.0..=1.0).contains(&seen.x), "{bad} at {at}: {seen}");
+            }
+        }
+    }
+
+    /// Footprints whose centres fill the image evenly see its mean on average, however long.
+    #[test]
+    fn the_mean_is_kept() {
+        let mut worst = 0.0_f64;
+        for count in [1, 2, 7, 13, 16, 31, 100] {
+            let sides = [[1e4, 1.0], [100.0, 0.01], [3.0, 3e-4], [0.3, 0.2], [0.05, 0.0], [0.0; 2]];
+            for (k, [long, short]) in sides.into_iter().chain(sides).enumerate() {
+                let is_across = k < sides.len();
+                let (width, height) = if is_across { (count, 1) } else { (1, count) };
+                let pyramids = image(width, height, noise);
+                let truth = pyramids.fine.iter().fold(DVec3::ZERO, |sum, &[r, g, b, _]| {
+                    sum + DVec3::new(r.into(), g.into(), b.into()) / (255.0 * f64::from(count))
+                });
+                let steps = 40_000;
+                let seen = (0..steps).map(|k| {
+                    let along = (f64::from(k) + 0.5) / f64::from(steps);
+                    let (at, sides) = if is_across {
+                        ([along, 0.3], [[long, 0.0], [0.0, short]])
+                    } else {
+                        ([0.3, along], [[short, 0.0], [0.0, long]])
+                    };
+                    look(&pyramids).mean(&footprint(at, sides))
+                });
+                let mean = seen.sum::<DVec3>() / f64::from(steps);
+                worst = worst.max((mean - truth).abs().max_element());
+            }
+        }
+        eprintln!("the mean is kept to {worst:.1e}");
+        assert!(worst < 1e-6);
+    }
+
+    #[test]
+    fn probes_stand_along_the_longer_axis() {
+        // Stripes that depend on v alone: a footprint along u sees them sharp.
+        let pyramids = image(64, 64, |_, y| [if y % 8 < 4 { 255 } else { 0 }; 3]);
+        let view = look(&pyramids);
+        let (u, v) = (0.3, 2.0 / 64.0);
+        let long = 12.0 / 64.0;
+        assert_eq!(view.mean(&footprint([u, v], [[long, 0.0], [0.0, 1e-3]])), DVec3::ONE);
+        assert_eq!(view.mean(&footprint([u, v], [[1e-3, 0.0], [long, 0.0]])), DVec3::ONE);
+        let across = view.mean(&footprint([u, v], [[0.0, 16.0 / 64.0], [1e-3, 0.0]]));
+        assert!((across.x - 0.5).abs() < 1e-6, "{across}");
+    }
+}

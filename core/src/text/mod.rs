@@ -1,0 +1,3 @@
+//! Numbers and words as bytes of text, whatever the file's language.
+
+pub(crate) mod number;

@@ -1,0 +1,135 @@
+//! Decimal numbers, rounded correctly; -0 becomes 0.
+
+use crate::language::lexer::{Class, class};
+
+/// The number that `word` spells; infinite when it is beyond f64.
+pub(crate) fn parse_number(word: &[u8]) -> Option<f64> {
+    let number: f64 = fast_float2::parse(word).ok()?;
+    Some(number + 0.0)
+}
+
+/// Reads a finite number at byte `at` of `text` and leaves `at` at the space, comment or end that
+/// follows it.
+///
+/// Source of the short way: Clinger, "How to Read Floating Point Numbers Accurately" (1990):
+/// whole numbers below 2^53 and powers of ten up to 10^22 are exact, so that one division rounds
+/// once.
+pub(crate) fn scan_number(text: &[u8], at: &mut usize) -> Option<f64> {
+    let byte_at = |at: usize| text.get(at).copied().unwrap_or(b' ');
+    let start = *at;
+    let mut here = start;
+    let is_negative = byte_at(here) == b'-';
+    here += usize::from(is_negative || byte_at(here) == b'+');
+    let mut mantissa = 0_u64;
+    let mut scan_digits = |here: &mut usize| {
+        let start = *here;
+        while let Some(&digit @ b'0'..=b'9') = text.get(*here) {
+            mantissa = mantissa.wrapping_mul(10).wrapping_add(u64::from(digit - b'0'));
+            *here += 1;
+        }
+        *here - start
+    };
+    let mut digit_count = scan_digits(&mut here);
+    let mut decimals = 0;
+    if byte_at(here) == b'.' {
+        here += 1;
+        decimals = scan_digits(&mut here);
+        digit_count += decimals;
+    }
+    let is_short =
+        (1..=19).contains(&digit_count) && mantissa <= 1 << 53 && decimals < POWERS_OF_TEN.len();
+    let number = if is_short && is_end(byte_at(here)) {
+        let size = mantissa as f64 / POWERS_OF_TEN[decimals];
+        if is_negative { 0.0 - size } else { size }
+    } else {
+        while class(byte_at(here)) == Class::Word {
+            here += 1;
+        }
+        is_end(byte_at(here)).then_some(())?;
+        parse_number(&text[start..here]).filter(|number| number.is_finite())?
+    };
+    *at = here;
+    Some(number)
+}
+
+fn is_end(byte: u8) -> bool {
+    matches!(class(byte), Class::Space | Class::Comment)
+}
+
+const POWERS_OF_TEN: [f64; 23] = [
+    1e0, 1e1, 1e2, 1e3, 1e4, 1e5, 1e6, 1e7, 1e8, 1e9, 1e10, 1e11, 1e12, 1e13, 1e14, 1e15, 1e16,
+    1e17, 1e18, 1e19, 1e20, 1e21, 1e22,
+];
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::exact::hash::mix;
+
+    fn check_scan(text: &str) {
+        let mut at = 0;
+        let expected = parse_number(text.as_bytes()).filter(|number| number.is_finite());
+        for rest in ["", " 1", "\n", "#"] {
+            at = 0;
+            let scanned = scan_number(format!("{text}{rest}").as_bytes(), &mut at);
+            assert_eq!(scanned.map(f64::to_bits), expected.map(f64::to_bits), "{text:?} {rest:?}");
+        }
+        assert!(expected.is_none() || at == text.len(), "{text:?}");
+    }
+
+    #[test]
+    fn scanning_equals_parsing() {
+        for text in [
+            "0",
+            "-0",
+            "-0.0",
+            "+1.5",
+            "20.",
+            ".5",
+            "1e-05",
+            "-.",
+            ".",
+            "",
+            "-",
+            "+",
+            "1e400",
+            "1e",
+            "0x1",
+            "1,5",
+            "123456789012345678",
+            "1234567890123456789",
+            "12345678901234567890",
+            "9007199254740993",
+            "0.00000000000000000000001",
+            "0.000000000000000000000001",
+            "4.9e-324",
+            "1.7976931348623157e308",
+            "nan",
+        ] {
+            check_scan(text);
+        }
+    }
+
+    #[test]
+    fn scanning_equals_parsing_for_random_numbers() {
+        let mut state = 1;
+        let mut random = |below: u64| {
+            state = mix(state + 1, 0x1234_5678_9abc_def1);
+            (state >> 20) % below
+        };
+        for _ in 0..20_000 {
+            let sign = ["", "-", "+"][random(3) as usize];
+            let mut digits =
+                |most: u64| (0..random(most)).map(|_| random(10).to_string()).collect::<String>();
+            let (whole, decimals) = (digits(20), digits(24));
+            check_scan(&format!("{sign}{whole}.{decimals}"));
+            check_scan(&format!("{sign}{whole}"));
+            check_scan(&format!("{sign}{whole}.{decimals}e{}", random(400).cast_signed() - 200));
+        }
+        for _ in 0..20_000 {
+            let number = f64::from_bits(mix(random(u64::MAX), 1));
+            check_scan(&format!("{number}"));
+            check_scan(&format!("{number:e}"));
+        }
+    }
+}
