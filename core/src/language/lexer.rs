@@ -3,7 +3,10 @@
 
 use std::ops::Range;
 
-use crate::text::number::parse_number;
+use crate::text::{
+    bytes::{Class, class},
+    number::parse_number,
+};
 
 /// Walks over the words of a scene text.
 #[derive(Debug, Clone)]
@@ -80,36 +83,6 @@ fn unsigned(word: &[u8]) -> &[u8] {
 fn is_infinity_or_nan(unsigned: &[u8]) -> bool {
     ["nan", "inf", "infinity"].iter().any(|name| unsigned.eq_ignore_ascii_case(name.as_bytes()))
 }
-
-/// What a byte does to the words around it.
-#[derive(Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Class {
-    Word,
-    Space,
-    Comment,
-    /// Part of a character beyond ASCII, which may be white space.
-    Wide,
-}
-
-/// What `byte` does to words.
-pub(crate) fn class(byte: u8) -> Class {
-    CLASSES[byte as usize]
-}
-
-const CLASSES: [Class; 256] = {
-    let mut classes = [Class::Word; 256];
-    let mut byte = 0;
-    while byte < 256 {
-        classes[byte] = match byte as u8 {
-            b' ' | b'\t' | b'\n' | b'\r' | 0x0b | 0x0c => Class::Space,
-            b'#' => Class::Comment,
-            0x80.. => Class::Wide,
-            _ => Class::Word,
-        };
-        byte += 1;
-    }
-    classes
-};
 
 impl<'t> Lexer<'t> {
     /// Starts at byte `at` of `text`.

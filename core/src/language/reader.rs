@@ -9,7 +9,6 @@ use std::{collections::HashMap, io, sync::Arc};
 
 use glam::DVec3;
 
-pub use super::diagnostic::{Diagnostic, Omitted, Related, Severity, Style, draw_diagnostics};
 use super::{
     block::{Block, Blocks, Field, suggestion},
     diagnostic::{Places, Report, shown},
@@ -28,6 +27,8 @@ use crate::{
     tile::Size,
     transfer::Transfer,
 };
+
+pub use super::diagnostic::{Diagnostic, Omitted, Related, Severity, Style, draw_diagnostics};
 
 /// Reads the bytes of a file that a scene names; the path is as the scene has it.
 pub type Resolve<'a> = dyn Fn(&str) -> io::Result<Vec<u8>> + Sync + 'a;

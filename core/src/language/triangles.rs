@@ -3,12 +3,13 @@
 //! not plain and leaves it to the reader of all blocks, so that there is one place that knows
 //! about mistakes, and any number of threads reads the same scene.
 
-use glam::{DVec2, DVec3};
 use hashbrown::{HashTable, hash_table::Entry};
 use rayon::prelude::*;
 
+use glam::{DVec2, DVec3};
+
 use super::{
-    lexer::{Class, Lexer, Quotes, Word, class},
+    lexer::{Lexer, Quotes, Word},
     symbol::Symbols,
 };
 use crate::{
@@ -17,7 +18,10 @@ use crate::{
         predicates::is_collinear,
     },
     scene::{Dropped, Triangle},
-    text::number::scan_number,
+    text::{
+        bytes::{Class, class},
+        number::scan_number,
+    },
 };
 
 /// Bytes of text that are parsed at once: enough to keep a thread busy, few enough that what is

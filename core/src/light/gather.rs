@@ -5,12 +5,14 @@
 use super::sampling::{self, Aim, Receiver};
 use crate::{
     isa::Isa,
-    prepared::{Features, View},
-    render::wavefront::{Point, face_normal, surface_color},
+    prepared::{layout::View, record::Features},
     sample::Sample,
-    shade::ray_differential::Patch,
+    shade::{
+        point::{Point, surface_color},
+        ray_differential::Patch,
+    },
     trace::{
-        batch::{self, trace},
+        batch::trace,
         ray::{Hit, Ray},
     },
 };
@@ -116,8 +118,8 @@ impl Gatherer {
     fn meet(&mut self, view: &View<'_>, ray: &Ray, hit: &Hit, seeker: Seeker) {
         let position = ray.origin + hit.t * ray.direction;
         let distance = seeker.distance + hit.t;
-        let surface = batch::surface(view, hit.item, hit.part);
-        let material = &view.materials[batch::material(view, hit.item, hit.part) as usize];
+        let surface = hit.face.surface(view);
+        let material = hit.face.material(view);
         if material.emits() {
             let Seeker { receiver, aim, .. } = &seeker;
             let density = match aim.emitter {
@@ -133,7 +135,7 @@ impl Gatherer {
             };
             let weight = seeker.share * (material.reflect * material.alpha) / density;
             if weight > 0.0 {
-                let outward = face_normal(view, hit, position);
+                let outward = hit.face.normal(view, position);
                 let is_front = outward.dot(ray.direction) <= 0.0;
                 // A texture's truth: a mean over all samples needs no coarser level.
                 let finest = Some(Patch::POINT);

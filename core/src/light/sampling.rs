@@ -10,7 +10,10 @@ use glam::DVec3;
 
 use super::tree::Survey;
 use crate::{
-    prepared::{EmitterRecord, Features, View},
+    prepared::{
+        layout::View,
+        record::{EmitterRecord, Features},
+    },
     sample::GatherNumbers,
 };
 

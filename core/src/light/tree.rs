@@ -7,10 +7,10 @@
 use glam::DVec3;
 
 use super::sampling::{FULL_SHARE, Promise, Receiver, promise, sphere_share};
-use crate::prepared::{EmitterNode, EmitterRecord, View};
-
-/// No such node.
-pub(crate) const NO_NODE: u32 = u32::MAX;
+use crate::prepared::{
+    layout::View,
+    record::{EmitterNode, NO_NODE},
+};
 
 /// Nodes that are compared at a receiver before the walk.
 const OPENED: usize = 8;
@@ -162,104 +162,4 @@ fn node_promise(view: &View<'_>, receiver: &Receiver, index: u32) -> Promise {
     };
     let share = whole * node.fill;
     Promise { share, light: share * node.radiosity, square: 0.0 }
-}
-
-/// What the tree is made of: an emitter's bounding ball, its area and what it sends on.
-#[derive(Debug, Clone, Copy)]
-pub(crate) struct Twig {
-    pub(crate) center: DVec3,
-    pub(crate) radius: f64,
-    pub(crate) area: f64,
-}
-
-/// Builds the tree over `emitters`, of which `twigs` tells more, and enters their nodes in them.
-/// The root is node 0, two children stand side by side after their parent.
-pub(crate) fn build_tree(emitters: &mut [EmitterRecord], twigs: &[Twig]) -> Vec<EmitterNode> {
-    if emitters.is_empty() {
-        return Vec::new();
-    }
-    let mut order: Vec<u32> = (0..emitters.len() as u32).collect();
-    let mut nodes = vec![EmitterNode::leaf(NO_NODE, 0)];
-    // Nodes to make, of runs of the order.
-    let mut waiting = vec![(0_usize, 0..emitters.len())];
-    while let Some((index, run)) = waiting.pop() {
-        let parent = nodes[index].parent;
-        let part = &mut order[run.clone()];
-        if let [emitter] = *part {
-            nodes[index] = EmitterNode::leaf(parent, emitter);
-            emitters[emitter as usize].node = index as u32;
-            continue;
-        }
-        let (mut low, mut high) = (DVec3::INFINITY, DVec3::NEG_INFINITY);
-        let (mut min, mut max) = (low, high);
-        let (mut area, mut power) = (0.0, 0.0);
-        for &emitter in part.iter() {
-            let Twig { center, radius, area: own } = twigs[emitter as usize];
-            (low, high) = (low.min(center), high.max(center));
-            (min, max) = (min.min(center - radius), max.max(center + radius));
-            area += own;
-            let [front, back] = emitters[emitter as usize].radiosity;
-            power += own * front.max(back);
-        }
-        let extent = high - low;
-        let axis = if extent.x >= extent.max_element() {
-            0
-        } else if extent.y >= extent.z {
-            1
-        } else {
-            2
-        };
-        let center = min + (max - min) / 2.0;
-        let reach = |&emitter: &u32| {
-            let Twig { center: of_emitter, radius, .. } = twigs[emitter as usize];
-            (of_emitter - center).length() + radius
-        };
-        let radius = part.iter().map(reach).fold(0.0, f64::max);
-        let middle = part.len() / 2;
-        part.select_nth_unstable_by(middle, |&a, &b| {
-            let place = |emitter: u32| twigs[emitter as usize].center[axis];
-            place(a).total_cmp(&place(b)).then(a.cmp(&b))
-        });
-        let child = nodes.len();
-        // Half of the area is turned away.
-        let fill = (area / (std::f64::consts::TAU * (radius * radius))).min(1.0);
-        nodes[index] = EmitterNode {
-            center: center.to_array(),
-            radius,
-            fill,
-            radiosity: power / area,
-            parent,
-            child: child as u32,
-            emitter: u32::MAX,
-            padding: 0,
-        };
-        nodes.extend([EmitterNode::leaf(index as u32, 0); 2]);
-        waiting.push((child, run.start..run.start + middle));
-        waiting.push((child + 1, run.start + middle..run.end));
-    }
-    nodes
-}
-
-/// Whether nodes are such a tree over the emitters: every walk up or down ends.
-pub(crate) fn check_tree(nodes: &[EmitterNode], emitters: &[EmitterRecord]) -> Result<(), ()> {
-    let ensure = |holds: bool| if holds { Ok(()) } else { Err(()) };
-    ensure(nodes.len() == (2 * emitters.len()).saturating_sub(1))?;
-    let mut parents = vec![NO_NODE; nodes.len()];
-    for (index, node) in (0..).zip(nodes) {
-        ensure(node.parent == parents[index as usize])?;
-        ensure((node.parent == NO_NODE) == (index == 0))?;
-        if node.is_leaf() {
-            let emitter = emitters.get(node.emitter as usize).ok_or(())?;
-            ensure(emitter.node == index)?;
-            continue;
-        }
-        ensure(node.child > index && (node.child as usize) < nodes.len() - 1)?;
-        for child in [node.child, node.child + 1] {
-            let parent = &mut parents[child as usize];
-            ensure(*parent == NO_NODE)?;
-            *parent = index;
-        }
-    }
-    // As many leaves as emitters, each its own emitter's.
-    ensure(emitters.iter().all(|emitter| (emitter.node as usize) < nodes.len()))
 }

@@ -8,10 +8,7 @@
 
 use rayon::prelude::*;
 
-use crate::trace::boxes::{Child, Node};
-
-/// Levels that a hierarchy may have: a path from the root visits at most this many nodes.
-pub(crate) const MOST_LEVELS: usize = 64;
+use crate::prepared::node::{Child, Node};
 
 /// From this level on, cuts are made in the middle, so that a path ends within 28 more.
 const MEDIAN_LEVEL: usize = 32;
@@ -286,7 +283,7 @@ fn build_node(part: Part<'_>, level: usize) -> Vec<Node> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::long::tell;
+    use crate::{long::tell, prepared::node::MOST_LEVELS};
 
     fn check(boxes: &[([f32; 3], [f32; 3])]) -> Vec<Node> {
         let mut leaflets: Vec<Leaflet> = boxes

@@ -2,10 +2,8 @@
 
 use glam::{DVec2, DVec3};
 
-use crate::{
-    light::tree::{NO_NODE, Twig, build_tree},
-    prepared::{EmitterNode, EmitterRecord, LightRecord, MaterialRecord},
-};
+use super::emitter_tree::{Twig, build_tree};
+use crate::prepared::record::{EmitterNode, EmitterRecord, LightRecord, MaterialRecord, NO_NODE};
 
 /// The most lights that are asked about one face; of more, every second, third and so on stands
 /// for those between.

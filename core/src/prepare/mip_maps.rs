@@ -2,46 +2,13 @@
 //!
 //! Source: Williams, "Pyramidal Parametrics" (1983).
 
-use std::ops::Range;
-
 use rayon::prelude::*;
 
-use crate::{scene::Texture, transfer::Transfer};
-
-/// An image: a run of levels.
-#[derive(Debug, Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
-#[repr(C)]
-pub(crate) struct TextureRecord {
-    pub(crate) first_level: u32,
-    /// At least 1.
-    pub(crate) level_count: u32,
-}
-
-/// An image at one size.
-#[derive(Debug, Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
-#[repr(C)]
-pub(crate) struct LevelRecord {
-    pub(crate) width: u32,
-    pub(crate) height: u32,
-    /// Of its first texel: of an image's first level among the fine ones, else among the coarse
-    /// ones.
-    pub(crate) offset: u64,
-}
-
-impl TextureRecord {
-    pub(crate) fn levels(self) -> Range<usize> {
-        self.first_level as usize..self.first_level as usize + self.level_count as usize
-    }
-}
-
-impl LevelRecord {
-    /// Whether it has texels, and they are among so many.
-    pub(crate) fn lies_within(&self, texel_count: usize) -> bool {
-        let count = u64::from(self.width) * u64::from(self.height);
-        let end = self.offset.checked_add(count);
-        count > 0 && end.is_some_and(|end| end <= texel_count as u64)
-    }
-}
+use crate::{
+    prepared::record::{LevelRecord, TextureRecord},
+    scene::Texture,
+    transfer::Transfer,
+};
 
 /// Images with all their levels, `[y][x]` each.
 #[derive(Debug, Default)]

@@ -1,6 +1,7 @@
 //! A scene into the records of a prepared scene.
 
 pub(crate) mod bvh;
+mod emitter_tree;
 mod emitters;
 pub(crate) mod mip_maps;
 mod planes;
@@ -8,29 +9,33 @@ mod weld;
 
 use std::collections::HashMap;
 
-use glam::{DVec2, DVec3};
 use rayon::prelude::*;
 
 use self::bvh::{Bounds, Leaflet};
 use self::emitters::{Emitters, smaller_ball, within};
 use self::mip_maps::Pyramids;
 use self::weld::weld;
+
+use glam::{DVec2, DVec3};
+
 use crate::{
-    exact::predicates::is_coplanar,
+    exact::{
+        float::{above, below, power_of_two_below_inverse},
+        predicates::is_coplanar,
+    },
     prepared::{
-        Camera, CoplanarRecord, EmitterNode, EmitterRecord, Features, LeafRecord, LightRecord,
-        Lighting, MaterialRecord, PlaneIndex, PlaneRecord, PreparedBytes, QuadrangleRecord,
-        Sections, SolidRecord, SphereRecord, TexturedFace, TriangleRecord, assemble,
-        power_of_two_below_inverse,
+        bytes::{PreparedBytes, assemble},
+        face::triangle_normal,
+        layout::Sections,
+        node::{Child, Frame},
+        record::{
+            Camera, CoplanarRecord, DIFFERENCE, EmitterNode, EmitterRecord, Features, INTERSECTION,
+            Item, Kind, LEAF, LeafRecord, LightRecord, Lighting, MaterialRecord, NO_NODE,
+            NodeRecord, PlaneIndex, PlaneRecord, QuadrangleRecord, SolidRecord, SphereRecord,
+            Surface, Texcoords, TexturedFace, TriangleRecord, UNION,
+        },
     },
     scene::{self, Material, Mesh, MeshVertices, Operation, Parallelepiped, Scene, SolidNode},
-    shade::chart::Texcoords,
-    trace::{
-        boxes::{self, Child, Frame},
-        ray::{Item, Kind, Surface},
-        solid::{self, NodeRecord},
-        triangle::triangle_normal,
-    },
     transfer::Transfer,
 };
 
@@ -92,7 +97,7 @@ fn prepare_gathering(scene: &Scene, gathering: u32) -> Result<PreparedBytes, Pre
     }
     let images = Images::gather(scene, &ranks);
     let materials: Vec<MaterialRecord> = (scene.materials.iter().zip(&images.of_materials))
-        .map(|(material, &texture)| MaterialRecord::new(material, texture))
+        .map(|(material, &texture)| material_record(material, texture))
         .collect();
     let [eye, top_left, bottom_left, top_right] =
         [viewport.eye, viewport.top_left, viewport.bottom_left, viewport.top_right]
@@ -191,6 +196,11 @@ impl Images {
             .collect();
         Self { pyramids, of_materials, faces }
     }
+}
+
+fn material_record(material: &Material, texture: u32) -> MaterialRecord {
+    let Material { color, reflect, alpha, refract, .. } = *material;
+    MaterialRecord::new(color, [reflect, alpha, refract], texture)
 }
 
 fn worn_by(count: usize, materials: impl Iterator<Item = u32>) -> Vec<bool> {
@@ -398,16 +408,21 @@ impl Faces {
         for (index, node) in (0..).zip(&solid.nodes) {
             let number = (self.leaves.len() - first_leaf) as u32;
             let mut record = NodeRecord {
-                operation: solid::LEAF,
-                parent: solid::NO_NODE,
+                operation: LEAF,
+                parent: NO_NODE,
                 first_child: number,
-                next: solid::NO_NODE,
+                next: NO_NODE,
                 operands: 0,
                 is_first: 0,
             };
             let bounds = match node {
                 SolidNode::Sphere(sphere) => {
-                    self.leaves.push(LeafRecord::sphere(sphere, index));
+                    self.leaves.push(LeafRecord::sphere(
+                        sphere.center,
+                        sphere.radius,
+                        sphere.material,
+                        index,
+                    ));
                     (sphere.center - sphere.radius, sphere.center + sphere.radius)
                 }
                 SolidNode::Parallelepiped(solid) => {
@@ -421,14 +436,14 @@ impl Faces {
                 SolidNode::Operation { operation, operands } => {
                     let operands = waiting.split_off(waiting.len() - *operands as usize);
                     record.operation = match operation {
-                        Operation::Union => solid::UNION,
-                        Operation::Intersection => solid::INTERSECTION,
-                        Operation::Difference => solid::DIFFERENCE,
+                        Operation::Union => UNION,
+                        Operation::Intersection => INTERSECTION,
+                        Operation::Difference => DIFFERENCE,
                     };
                     record.operands = operands.len() as u32;
                     record.first_child = operands[0].0;
                     for (k, &(child, _)) in operands.iter().enumerate() {
-                        let next = operands.get(k + 1).map_or(solid::NO_NODE, |next| next.0);
+                        let next = operands.get(k + 1).map_or(NO_NODE, |next| next.0);
                         let child = &mut self.solid_nodes[first_node + child as usize];
                         (child.parent, child.next) = (index, next);
                         child.is_first = u32::from(k == 0);
@@ -464,9 +479,8 @@ impl Faces {
         let mut is_turned = vec![false; nodes.len()];
         for index in (0..nodes.len()).rev() {
             let NodeRecord { parent, is_first, .. } = nodes[index];
-            if parent != solid::NO_NODE {
-                let is_taken =
-                    nodes[parent as usize].operation == solid::DIFFERENCE && is_first == 0;
+            if parent != NO_NODE {
+                let is_taken = nodes[parent as usize].operation == DIFFERENCE && is_first == 0;
                 is_turned[index] = is_turned[parent as usize] ^ is_taken;
             }
         }
@@ -676,8 +690,8 @@ impl Faces {
             // Rounding to f64 must not pull a box in.
             let relative = |point: DVec3| ((point - origin) * frame.scale).to_array();
             Bounds {
-                min: relative(min).map(|x| boxes::below(x - x.abs() * f64::EPSILON)),
-                max: relative(max).map(|x| boxes::above(x + x.abs() * f64::EPSILON)),
+                min: relative(min).map(|x| below(x - x.abs() * f64::EPSILON)),
+                max: relative(max).map(|x| above(x + x.abs() * f64::EPSILON)),
             }
         };
         let mut leaflets: Vec<Leaflet> = (0..self.flat_count())

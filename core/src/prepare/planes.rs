@@ -4,10 +4,11 @@
 //! another that lies on it. So faces in exactly the same plane share one plane record. Real
 //! scenes hold thousands of copies of one triangle, and labels that lie in a wall.
 
-use glam::DVec3;
 use rayon::prelude::*;
 
-use crate::{prepared::power_of_two_below_inverse, trace::ray::exact_product};
+use glam::DVec3;
+
+use crate::exact::float::{exact_product, power_of_two_below_inverse};
 
 /// A number that planes have in common exactly when they are the same plane, whichever points
 /// they are given by and whichever way they face.

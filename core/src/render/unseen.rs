@@ -9,16 +9,17 @@
 
 use glam::DVec3;
 
-use super::{pixel::UNSEEN, wavefront::face_normal};
+use super::pixel::UNSEEN;
 use crate::{
-    prepared::{LeafRecord, MaterialRecord, View},
+    prepared::{
+        face::{Face, Part},
+        layout::View,
+        node::Child,
+        record::{Item, Kind, LeafRecord, MaterialRecord},
+    },
     sample::Samples,
     tile::{Area, Size},
-    trace::{
-        batch,
-        boxes::Child,
-        ray::{Hit, Item, Kind},
-    },
+    trace::ray::Hit,
 };
 
 /// Pixels on the side of a block that is searched in one go, and how many faces it may hold: else
@@ -93,8 +94,7 @@ pub(crate) struct Look<'a> {
 /// A face on the screen.
 #[derive(Debug, Clone, Copy)]
 struct Outline {
-    item: Item,
-    part: u32,
+    face: Face,
     rank: u32,
     /// Of its corners.
     first: usize,
@@ -343,38 +343,24 @@ impl<'a> Beams<'a> {
 
     fn gather_item(&mut self, item: Item, block: Area, deepest: f64) {
         let view = self.view;
-        let index = item.index();
-        let eye = self.eye;
-        let relative = |corner: &[f64; 3]| DVec3::from_array(*corner) - eye;
+        let face = Face::whole(item);
         match item.kind() {
-            Some(Kind::Triangle) => {
-                let face = &view.triangles[index];
-                let corners = view.corners(&face.vertices).map(relative);
-                self.gather_polygon((item, 0, face.rank), &corners, block, deepest);
-            }
-            Some(Kind::Coplanar) => {
-                let face = &view.coplanars[index];
-                let corners = view.corners(&face.vertices).map(relative);
-                self.gather_polygon((item, 0, face.rank), &corners, block, deepest);
-            }
-            Some(Kind::Quadrangle) => {
-                let face = &view.quadrangles[index];
-                let corners = view.corners(&face.vertices).map(relative);
-                self.gather_polygon((item, 0, face.rank), &corners, block, deepest);
+            Some(Kind::Triangle | Kind::Coplanar | Kind::Quadrangle) => {
+                let polygon = face.polygon(view).expect("a triangle or a quadrangle");
+                let corners = polygon.relative_to(self.eye);
+                self.gather_polygon(face, corners.corners(), block, deepest);
             }
             Some(Kind::Sphere) => {
-                let sphere = &view.spheres[index];
-                let center = relative(&sphere.center);
-                self.gather_sphere((item, 0, sphere.rank), center, sphere.radius, block, deepest);
+                let sphere = &view.spheres[item.index()];
+                let center = DVec3::from_array(sphere.center) - self.eye;
+                self.gather_sphere(face, center, sphere.radius, block, deepest);
             }
             Some(Kind::Solid) => {
-                let solid = &view.solids[index];
+                let solid = &view.solids[item.index()];
                 for (number, leaf) in (0..).zip(view.solid_leaves(solid)) {
                     // What is taken away is seen where something is left.
                     if leaf.is_turned == 0 {
-                        let part = 6 * number;
-                        let face = (item, part, solid.rank + part);
-                        self.gather_leaf(face, leaf, block, deepest);
+                        self.gather_leaf(item, number, leaf, block, deepest);
                     }
                 }
             }
@@ -384,14 +370,16 @@ impl<'a> Beams<'a> {
 
     fn gather_leaf(
         &mut self,
-        (item, part, rank): (Item, u32, u32),
+        item: Item,
+        number: u32,
         leaf: &LeafRecord,
         block: Area,
         deepest: f64,
     ) {
+        let part = |face: u32| Face { item, part: Part::new(number, face) };
         if leaf.is_sphere() {
             let center = DVec3::from_array(leaf.center) - self.eye;
-            return self.gather_sphere((item, part, rank), center, leaf.radius, block, deepest);
+            return self.gather_sphere(part(0), center, leaf.radius, block, deepest);
         }
         let planes = leaf.planes.map(|plane| &self.view.planes[plane.index()]);
         let normals = planes.map(|plane| DVec3::from_array(plane.normal));
@@ -411,21 +399,13 @@ impl<'a> Beams<'a> {
                 .map(|(u, v)| corner(face, u, v));
             // Planes that are as good as parallel meet nowhere.
             if corners.iter().all(|corner| corner.is_finite()) {
-                let face = face as u32;
-                self.gather_polygon((item, part + face, rank + face), &corners, block, deepest);
+                self.gather_polygon(part(face as u32), &corners, block, deepest);
             }
         }
     }
 
     /// A sphere that is small on the screen is an octagon as large as its disc.
-    fn gather_sphere(
-        &mut self,
-        face: (Item, u32, u32),
-        center: DVec3,
-        radius: f64,
-        block: Area,
-        deepest: f64,
-    ) {
+    fn gather_sphere(&mut self, face: Face, center: DVec3, radius: f64, block: Area, deepest: f64) {
         let square = center.length_squared();
         let sine = radius * radius / square;
         let depth = self.rows[0].dot(center);
@@ -445,13 +425,7 @@ impl<'a> Beams<'a> {
 
     /// Adds the outline of a polygon, by its corners relative to the eye, if it meets the block and
     /// begins before the depth.
-    fn gather_polygon(
-        &mut self,
-        (item, part, rank): (Item, u32, u32),
-        corners: &[DVec3],
-        block: Area,
-        deepest: f64,
-    ) {
+    fn gather_polygon(&mut self, face: Face, corners: &[DVec3], block: Area, deepest: f64) {
         let [depth, across, down] = self.rows;
         let first = self.corners.len();
         let (mut nearest, mut furthest) = (f64::INFINITY, 0.0_f64);
@@ -482,7 +456,8 @@ impl<'a> Beams<'a> {
             }
         }
         let count = self.corners.len() - first;
-        let outline = Outline { item, part, rank, first, count, low, high, nearest };
+        let rank = face.rank(self.view).expect("a face of the scene");
+        let outline = Outline { face, rank, first, count, low, high, nearest };
         if nearest <= deepest && outline.meets(block) {
             self.outlines.push(outline);
         } else {
@@ -527,8 +502,8 @@ impl<'a> Beams<'a> {
             }
             let direction = self.direction(place);
             let place = direction * (hit.t / direction.length());
-            let normal = turned_to_eye(face_normal(self.view, hit, self.eye + place), place);
-            let material = batch::material(self.view, hit.item, hit.part);
+            let normal = turned_to_eye(hit.face.normal(self.view, self.eye + place), place);
+            let material = hit.face.material_index(self.view);
             self.seen.push(Patch { material, normal, place });
         }
     }
@@ -537,7 +512,7 @@ impl<'a> Beams<'a> {
     /// been passed by a sample.
     fn judge(&mut self, index: usize, pixel: Area, look: &Look<'_>, unseen: &mut Unseen) {
         let outline = self.outlines[index];
-        let material = batch::material(self.view, outline.item, outline.part);
+        let material = outline.face.material_index(self.view);
         let mut contrast = self.contrast(material, look.mean);
         if outline.area_of_rectangle(pixel) * contrast.max_element() < NEGLIGIBLE * self.error {
             return;
@@ -642,19 +617,10 @@ impl<'a> Beams<'a> {
 
     /// The unit normal of a face, to either side, where it is small or flat.
     fn normal(&self, outline: &Outline, place: DVec3) -> DVec3 {
-        let Outline { item, part, .. } = *outline;
-        let hit = Hit { t: 0.0, rank: outline.rank, item, part };
-        match item.kind() {
-            Some(Kind::Sphere) => -place / place.length(),
-            Some(Kind::Solid) => {
-                let leaf =
-                    &self.view.solid_leaves(&self.view.solids[item.index()])[part as usize / 6];
-                if leaf.is_sphere() {
-                    return -place / place.length();
-                }
-                face_normal(self.view, &hit, place)
-            }
-            _ => face_normal(self.view, &hit, place),
+        if outline.face.is_round(self.view) {
+            -place / place.length()
+        } else {
+            outline.face.normal(self.view, place)
         }
     }
 

@@ -8,21 +8,21 @@ use std::ops::ControlFlow;
 
 use glam::DVec3;
 
-use super::{Quality, Settings};
+use super::settings::{Quality, Settings};
 use crate::{
     isa::Isa,
     left_out,
     light::gather::Gatherer,
-    prepared::{MaterialRecord, PlaneIndex, View},
+    prepared::{layout::View, record::Surface},
     sample::{Sample, node_after},
     shade::{
-        ray_differential::{Patch, Spread},
-        texture::texture_color,
+        optics::{mirror, refract},
+        point::{Point, surface_color},
+        ray_differential::Spread,
     },
     trace::{
-        batch::{self, trace, trace_shadows},
-        ray::{Hit, Kind, Ray, Surface},
-        triangle::triangle_normal,
+        batch::{trace, trace_shadows},
+        ray::{Hit, Ray},
     },
 };
 
@@ -78,23 +78,6 @@ struct Branch {
     weight: f64,
     /// Tells the sample's branches apart; 0 for the camera ray.
     node: u64,
-}
-
-/// A place on a surface that a ray sees.
-#[derive(Debug)]
-pub(crate) struct Point {
-    pub(crate) sample: usize,
-    /// The number of the branch that has met it.
-    pub(crate) node: u64,
-    /// What the surface's own light counts in the sample.
-    pub(crate) weight: f64,
-    pub(crate) position: DVec3,
-    /// Of length 1, towards the side that is seen.
-    pub(crate) normal: DVec3,
-    pub(crate) surface: Surface,
-    pub(crate) color: DVec3,
-    /// The light received so far.
-    pub(crate) light: DVec3,
 }
 
 impl Batch {
@@ -211,11 +194,11 @@ impl Batch {
         let (ray, hit) = (&self.rays[index], &self.hits[index]);
         let Branch { sample, weight, node } = self.branches[index];
         let position = ray.origin + hit.t * ray.direction;
-        let outward = face_normal(view, hit, position);
+        let outward = hit.face.normal(view, position);
         let is_front = outward.dot(ray.direction) <= 0.0;
         let normal = if is_front { outward } else { -outward };
-        let surface = batch::surface(view, hit.item, hit.part);
-        let material = &view.materials[batch::material(view, hit.item, hit.part) as usize];
+        let surface = hit.face.surface(view);
+        let material = hit.face.material(view);
         let (reflect, alpha) = (material.reflect, material.alpha);
         let spread =
             HAS_TEXTURES.then(|| self.spreads[index].transfer(ray.direction, hit.t, normal));
@@ -253,7 +236,8 @@ impl Batch {
             };
         let cosine = -normal.dot(ray.direction);
         let mirrored = mirror(ray.direction, normal, cosine);
-        let curvature = if spread.is_some() { curvature(view, hit, position, normal) } else { 0.0 };
+        let curvature =
+            if spread.is_some() { hit.face.curvature(view, position, normal) } else { 0.0 };
         let mirrored_spread = spread.map(|spread| spread.mirror(ray.direction, normal, curvature));
         if reflect > 0.0 && !left_out::MIRROR {
             follow(mirrored, Ray::NOTHING_AHEAD, weight * reflect, 1, mirrored_spread);
@@ -335,87 +319,4 @@ impl Batch {
 /// Whether places look for light that other faces send on.
 fn gathers(view: &View<'_>, quality: &Quality) -> bool {
     quality.secondary && !quality.flat && view.header.features.has_emitters()
-}
-
-/// The colour of a face at a hit, its texture included, of which the sample sees `patch`. There is
-/// none in a scene without textures.
-#[inline(always)]
-pub(crate) fn surface_color(
-    view: &View<'_>,
-    material: &MaterialRecord,
-    hit: &Hit,
-    at: (DVec3, DVec3),
-    patch: Option<Patch>,
-) -> DVec3 {
-    let color = DVec3::from_array(material.color);
-    match patch {
-        Some(patch) if material.texture != MaterialRecord::PLAIN && !left_out::TEXTURE => {
-            color * texture_color(view, material.texture, hit, at, patch)
-        }
-        _ => color,
-    }
-}
-
-/// The direction of mirrored light; `cosine` is that between the normal and where it came from.
-fn mirror(direction: DVec3, normal: DVec3, cosine: f64) -> DVec3 {
-    let mirrored = direction + 2.0 * cosine * normal;
-    mirrored / mirrored.length()
-}
-
-/// The direction of light behind a face by Snell's law with n1/n2 = `ratio`; `None` on total
-/// reflection. The sine is taken as (1 - c)(1 + c), which keeps its digits near the normal.
-fn refract(direction: DVec3, normal: DVec3, cosine: f64, ratio: f64) -> Option<DVec3> {
-    let square = 1.0 - ratio * ratio * ((1.0 - cosine) * (1.0 + cosine));
-    (square >= 0.0).then(|| {
-        let bent = ratio * direction + (ratio * cosine - square.sqrt()) * normal;
-        bent / bent.length()
-    })
-}
-
-/// By how much a step along what a ray hit turns its `normal`, per unit of the step: 0 on a flat
-/// face, below 0 on a sphere that is seen from within.
-fn curvature(view: &View<'_>, hit: &Hit, position: DVec3, normal: DVec3) -> f64 {
-    let index = hit.item.index();
-    let center = match hit.item.kind() {
-        Some(Kind::Sphere) => view.spheres[index].center,
-        Some(Kind::Solid) => {
-            let leaf = &view.solid_leaves(&view.solids[index])[hit.part as usize / 6];
-            if !leaf.is_sphere() {
-                return 0.0;
-            }
-            leaf.center
-        }
-        _ => return 0.0,
-    };
-    let from_center = position - DVec3::from_array(center);
-    normal.dot(from_center) / from_center.length_squared()
-}
-
-/// The unit normal towards the front of what a ray hit.
-pub(crate) fn face_normal(view: &View<'_>, hit: &Hit, position: DVec3) -> DVec3 {
-    let of_plane =
-        |plane: PlaneIndex| DVec3::from_array(view.planes[plane.index()].normal) * plane.sign();
-    let of_sphere = |center: [f64; 3]| {
-        let outward = position - DVec3::from_array(center);
-        outward / outward.length()
-    };
-    let index = hit.item.index();
-    match hit.item.kind().expect("a checked item") {
-        Kind::Triangle => {
-            let corners = view.corners(&view.triangles[index].vertices);
-            triangle_normal(corners.map(|&corner| DVec3::from_array(corner)))
-        }
-        Kind::Coplanar => of_plane(view.coplanars[index].plane),
-        Kind::Quadrangle => of_plane(view.quadrangles[index].plane),
-        Kind::Sphere => of_sphere(view.spheres[index].center),
-        Kind::Solid => {
-            let leaf = &view.solid_leaves(&view.solids[index])[hit.part as usize / 6];
-            let outward = if leaf.is_sphere() {
-                of_sphere(leaf.center)
-            } else {
-                of_plane(leaf.planes[hit.part as usize % 6])
-            };
-            if leaf.is_turned == 1 { -outward } else { outward }
-        }
-    }
 }

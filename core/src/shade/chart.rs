@@ -2,7 +2,10 @@
 
 use glam::{DVec2, DVec3};
 
-use crate::{prepared::power_of_two_below_inverse, trace::ray::exact_product};
+use crate::{
+    exact::float::{exact_product, power_of_two_below_inverse},
+    prepared::record::Texcoords,
+};
 
 /// A face over the unit square: corner + s · along + t · up + s · t · twist. A triangle is the half
 /// below s + t = 1 of a parallelogram.
@@ -91,12 +94,6 @@ fn cross(a: DVec2, b: DVec2) -> f64 {
     let (right, right_error) = exact_product(a.y, b.x);
     (left - right) + (left_error - right_error)
 }
-
-/// Texture coordinates at the corners (0, 0), (1, 0), (1, 1) and (0, 1) of the unit square;
-/// bilinear between them.
-#[derive(Debug, Clone, Copy, PartialEq, bytemuck::Pod, bytemuck::Zeroable)]
-#[repr(transparent)]
-pub(crate) struct Texcoords(pub(crate) [[f64; 2]; 4]);
 
 impl Texcoords {
     /// Of a quadrangle, or of a triangle, whose corners are the first, the second and the last.

@@ -4,9 +4,11 @@ use glam::{DVec2, DVec3};
 
 use super::{chart::Chart, ray_differential::Patch};
 use crate::{
-    prepare::mip_maps::LevelRecord,
-    prepared::{TexturedFace, View},
-    trace::ray::{Hit, Kind},
+    prepared::{
+        layout::View,
+        record::{LevelRecord, TexturedFace},
+    },
+    trace::ray::Hit,
 };
 
 /// The most probes along a footprint's longer axis, and so how much longer than wide a footprint
@@ -38,27 +40,15 @@ pub(crate) fn texture_color(
         return DVec3::ONE;
     };
     let TexturedFace { texcoords, .. } = faces[face];
-    let index = hit.item.index();
-    let to_vectors = |corner: &[f64; 3]| DVec3::from_array(*corner);
-    let chart = match hit.item.kind() {
-        Some(Kind::Triangle) => {
-            Chart::new(&view.corners(&view.triangles[index].vertices).map(to_vectors), outward)
-        }
-        Some(Kind::Coplanar) => {
-            Chart::new(&view.corners(&view.coplanars[index].vertices).map(to_vectors), outward)
-        }
-        Some(Kind::Quadrangle) => {
-            Chart::new(&view.corners(&view.quadrangles[index].vertices).map(to_vectors), outward)
-        }
-        Some(Kind::Sphere | Kind::Solid) | None => return DVec3::ONE,
-    };
+    let Some(polygon) = hit.face.polygon(view) else { return DVec3::ONE };
+    let chart = Chart::new(polygon.corners(), outward);
     let place = chart.place(position);
     let footprint = Footprint {
         center: texcoords.at(place),
         sides: patch.sides.map(|side| texcoords.step(place, chart.step(place, side))),
         tapers: patch.tapers,
     };
-    view.texture(texture).mean(&footprint)
+    TextureView::new(view, texture).mean(&footprint)
 }
 
 /// A texture that can be looked at.
@@ -71,7 +61,17 @@ pub(crate) struct TextureView<'a> {
     pub(crate) coarse: &'a [[f32; 3]],
 }
 
-impl TextureView<'_> {
+impl<'a> TextureView<'a> {
+    /// An image with its levels.
+    pub(crate) fn new(view: &View<'a>, index: u32) -> Self {
+        Self {
+            levels: &view.texture_levels[view.textures[index as usize].levels()],
+            fine: view.fine_texels,
+            light_of_bytes: view.header.features.texel_transfer().light_of_bytes(),
+            coarse: view.coarse_texels,
+        }
+    }
+
     /// The mean over a footprint, nearly: probes along its longer axis, each as wide as its shorter
     /// one is there. A footprint within a texel gives the image itself, bilinear between the middles
     /// of texels.

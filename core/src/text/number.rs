@@ -1,6 +1,6 @@
 //! Decimal numbers, rounded correctly; -0 becomes 0.
 
-use crate::language::lexer::{Class, class};
+use super::bytes::{Class, class};
 
 /// The number that `word` spells; infinite when it is beyond f64.
 pub(crate) fn parse_number(word: &[u8]) -> Option<f64> {

@@ -6,73 +6,10 @@
 
 use glam::DVec3;
 
-/// Eight boxes and what is in them.
-#[derive(Debug, Clone, Copy, PartialEq, bytemuck::Pod, bytemuck::Zeroable)]
-#[repr(C, align(32))]
-pub(crate) struct Node {
-    /// min x, min y, min z, max x, max y, max z of the eight children; an unused child has
-    /// min = ∞, max = -∞ and is never met.
-    pub(crate) planes: [[f32; 8]; 6],
-    /// What is in each box.
-    pub(crate) children: [Child; 8],
-}
-
-const _: () = assert!(size_of::<Node>() == 224);
-
-/// A node (bit 31 clear: its index, larger than its parent's), or a leaf (bit 31 set: how many
-/// items less one in 3 bits, then the first one's index).
-#[derive(Debug, Clone, Copy, PartialEq, Eq, bytemuck::Pod, bytemuck::Zeroable)]
-#[repr(transparent)]
-pub(crate) struct Child(pub(crate) u32);
-
-impl Child {
-    /// An unused child: the root's index, which no child can have.
-    pub(crate) const NONE: Self = Self(0);
-    /// The most items in a leaf.
-    pub(crate) const MOST_ITEMS: usize = 8;
-    /// The limit of items in a hierarchy.
-    pub(crate) const ITEM_LIMIT: usize = 1 << 28;
-
-    pub(crate) fn leaf(first: usize, count: usize) -> Self {
-        debug_assert!(first < Self::ITEM_LIMIT && (1..=Self::MOST_ITEMS).contains(&count));
-        Self(1 << 31 | (count as u32 - 1) << 28 | first as u32)
-    }
-
-    #[inline(always)]
-    pub(crate) fn is_leaf(self) -> bool {
-        self.0 >> 31 == 1
-    }
-
-    /// The items of a leaf.
-    #[inline(always)]
-    pub(crate) fn items(self) -> std::ops::Range<usize> {
-        let first = (self.0 & (Self::ITEM_LIMIT as u32 - 1)) as usize;
-        first..first + (self.0 >> 28 & 7) as usize + 1
-    }
-
-    /// The index of an inner node.
-    #[inline(always)]
-    pub(crate) fn node(self) -> usize {
-        self.0 as usize
-    }
-}
-
-impl Node {
-    /// A node without children.
-    pub(crate) const EMPTY: Self = {
-        let (low, high) = ([f32::INFINITY; 8], [f32::NEG_INFINITY; 8]);
-        Self { planes: [low, low, low, high, high, high], children: [Child::NONE; 8] }
-    };
-}
-
-/// The frame that boxes are kept in: box coordinate = (scene coordinate - origin) · scale, where
-/// scale is a power of two that brings the scene's extent into 0.5..=1.
-#[derive(Debug, Clone, Copy, PartialEq, bytemuck::Pod, bytemuck::Zeroable)]
-#[repr(C)]
-pub(crate) struct Frame {
-    pub(crate) origin: [f64; 3],
-    pub(crate) scale: f64,
-}
+use crate::{
+    exact::float::{above, below},
+    prepared::node::{Frame, Node},
+};
 
 /// A ray ready to meet boxes, in the boxes' frame.
 #[derive(Debug, Clone, Copy)]
@@ -168,20 +105,6 @@ impl BoxRay {
     pub(crate) fn reaches(&self, near: f32) -> bool {
         near <= self.high
     }
-}
-
-/// The largest f32 that is not above `value`.
-#[inline(always)]
-pub(crate) fn below(value: f64) -> f32 {
-    let rounded = value as f32;
-    if f64::from(rounded) > value { rounded.next_down() } else { rounded }
-}
-
-/// The smallest f32 that is not below `value`.
-#[inline(always)]
-pub(crate) fn above(value: f64) -> f32 {
-    let rounded = value as f32;
-    if f64::from(rounded) < value { rounded.next_up() } else { rounded }
 }
 
 /// Tests a ray against a node's eight boxes: the distances at which it enters them, and which of

@@ -2,7 +2,13 @@
 
 use glam::DVec3;
 
-use crate::left_out;
+use crate::{
+    exact::float::exact_product,
+    prepared::{
+        face::Face,
+        record::{Item, Surface},
+    },
+};
 
 /// A half-line, with what it must not meet.
 #[derive(Debug, Clone, Copy)]
@@ -25,17 +31,6 @@ impl Ray {
     pub(crate) const NOTHING_AHEAD: u32 = u32::MAX;
 }
 
-/// A surface, for leaving it: all faces in exactly one plane, all equal spheres, or else one face.
-/// (A ray that starts in a plane never meets that plane again.)
-#[derive(Debug, Clone, Copy, PartialEq, Eq, bytemuck::Pod, bytemuck::Zeroable)]
-#[repr(transparent)]
-pub(crate) struct Surface(pub(crate) u32);
-
-impl Surface {
-    /// A ray that starts in free space.
-    pub(crate) const NONE: Self = Self(u32::MAX);
-}
-
 /// The nearest face along a ray: the smallest (t, rank).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Hit {
@@ -43,73 +38,19 @@ pub(crate) struct Hit {
     pub(crate) t: f64,
     /// The face's place among all faces of the scene.
     pub(crate) rank: u32,
-    /// Which face, or which solid.
-    pub(crate) item: Item,
-    /// Of a solid: 6 · leaf + face.
-    pub(crate) part: u32,
+    /// What is hit.
+    pub(crate) face: Face,
 }
 
 impl Hit {
     /// Nothing, up to `reach`.
     pub(crate) fn none(reach: f64) -> Self {
-        Self { t: reach, rank: u32::MAX, item: Item::NONE, part: 0 }
+        Self { t: reach, rank: u32::MAX, face: Face::NONE }
     }
 
     /// Whether a face is hit.
     pub(crate) fn is_some(&self) -> bool {
-        self.item != Item::NONE
-    }
-}
-
-/// A face in the prepared scene: its kind in the upper 3 bits, its index among its kind below.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, bytemuck::Pod, bytemuck::Zeroable)]
-#[repr(transparent)]
-pub(crate) struct Item(u32);
-
-/// The kinds of faces.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Kind {
-    /// A triangle alone in its plane.
-    Triangle = 0,
-    /// A triangle that shares its plane with other faces.
-    Coplanar = 1,
-    /// A quadrangle.
-    Quadrangle = 2,
-    /// A sphere.
-    Sphere = 3,
-    /// A constructive solid.
-    Solid = 4,
-}
-
-impl Item {
-    /// No face.
-    pub(crate) const NONE: Self = Self(u32::MAX);
-    /// How many faces of one kind a scene may have.
-    pub(crate) const LIMIT: usize = 1 << 29;
-
-    /// A face of the given kind.
-    pub(crate) fn new(kind: Kind, index: usize) -> Self {
-        debug_assert!(index < Self::LIMIT);
-        Self((kind as u32) << 29 | index as u32)
-    }
-
-    /// The kind; `None` for bits that no kind has.
-    #[inline(always)]
-    pub(crate) fn kind(self) -> Option<Kind> {
-        match self.0 >> 29 {
-            0 => Some(Kind::Triangle),
-            1 => Some(Kind::Coplanar),
-            2 => Some(Kind::Quadrangle),
-            3 => Some(Kind::Sphere),
-            4 if !left_out::SOLID => Some(Kind::Solid),
-            _ => None,
-        }
-    }
-
-    /// The index among the faces of its kind.
-    #[inline(always)]
-    pub(crate) fn index(self) -> usize {
-        (self.0 & (Self::LIMIT as u32 - 1)) as usize
+        self.face.item != Item::NONE
     }
 }
 
@@ -211,24 +152,6 @@ pub(crate) fn side(a: &Projected, b: &Projected) -> i32 {
         .into_iter()
         .find(|&difference| difference != 0.0)
         .map_or(0, |difference| if difference > 0.0 { 1 } else { -1 })
-}
-
-/// a · b as the rounded product and what rounding took away, exact while neither overflows nor
-/// underflows. Source: Dekker, "A floating-point technique for extending the available precision"
-/// (1971), with Veltkamp's splitting.
-pub(crate) fn exact_product(a: f64, b: f64) -> (f64, f64) {
-    let product = a * b;
-    let (a_high, a_low) = split(a);
-    let (b_high, b_low) = split(b);
-    let error = a_low * b_low - (((product - a_high * b_high) - a_low * b_high) - a_high * b_low);
-    (product, error)
-}
-
-fn split(a: f64) -> (f64, f64) {
-    const SPLITTER: f64 = 134_217_729.0; // 2^27 + 1
-    let c = SPLITTER * a;
-    let high = c - (c - a);
-    (high, a - high)
 }
 
 #[cfg(test)]

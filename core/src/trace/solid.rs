@@ -9,70 +9,24 @@ use glam::DVec3;
 
 use super::{
     quadrangle::toward_plane,
-    ray::{Ray, Surface},
+    ray::Ray,
     sphere::{hit_sphere, hit_sphere_again},
 };
-use crate::prepared::{LeafRecord, PlaneIndex, SolidRecord, View};
-
-/// What joins a node's operands.
-pub(crate) const UNION: u32 = 0;
-pub(crate) const INTERSECTION: u32 = 1;
-pub(crate) const DIFFERENCE: u32 = 2;
-/// A node that is a leaf; `first_child` is its number among the solid's leaves.
-pub(crate) const LEAF: u32 = 3;
-/// No such node.
-pub(crate) const NO_NODE: u32 = u32::MAX;
-
-/// A node of a solid's tree. Indices count from the solid's first node; children stand before
-/// their parents.
-#[derive(Debug, Clone, Copy, PartialEq, bytemuck::Pod, bytemuck::Zeroable)]
-#[repr(C)]
-pub(crate) struct NodeRecord {
-    pub(crate) operation: u32,
-    pub(crate) parent: u32,
-    pub(crate) first_child: u32,
-    /// The parent's next operand.
-    pub(crate) next: u32,
-    /// How many operands.
-    pub(crate) operands: u32,
-    /// 1 for the operand of a difference that the others are taken from.
-    pub(crate) is_first: u32,
-}
-
-/// Whether nodes are a tree over these leaves in postfix order, so that walking it ends.
-pub(crate) fn check_tree(nodes: &[NodeRecord], leaves: &[LeafRecord]) -> Result<(), ()> {
-    let ensure = |holds: bool| if holds { Ok(()) } else { Err(()) };
-    ensure(nodes.last().is_some_and(|root| root.parent == NO_NODE))?;
-    let mut owners = vec![NO_NODE; nodes.len()];
-    let mut is_taken = vec![false; leaves.len()];
-    for (index, node) in (0..).zip(nodes) {
-        if node.operation == LEAF {
-            let leaf = leaves.get(node.first_child as usize).ok_or(())?;
-            let is_free = !std::mem::replace(&mut is_taken[node.first_child as usize], true);
-            ensure(is_free && leaf.node == index)?;
-            continue;
-        }
-        ensure(node.operation < LEAF && node.operands >= 2)?;
-        let mut child = node.first_child;
-        for operand in 0..node.operands {
-            ensure(child < index && owners[child as usize] == NO_NODE)?;
-            owners[child as usize] = index;
-            ensure((nodes[child as usize].is_first == 1) == (operand == 0))?;
-            child = nodes[child as usize].next;
-        }
-        ensure(child == NO_NODE)?;
-    }
-    ensure(is_taken.iter().all(|&taken| taken))?;
-    ensure(nodes.iter().zip(&owners).all(|(node, &owner)| node.parent == owner))
-}
+use crate::prepared::{
+    face::Part,
+    layout::View,
+    record::{
+        DIFFERENCE, INTERSECTION, LEAF, LeafRecord, NO_NODE, NodeRecord, PlaneIndex, SolidRecord,
+        Surface, UNION,
+    },
+};
 
 /// Where a ray crosses a solid's surface.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Crossing {
     /// In units of the ray's direction.
     pub(crate) t: f64,
-    /// Which leaf's which face: 6 · leaf + face.
-    pub(crate) part: u32,
+    pub(crate) part: Part,
 }
 
 /// Where a ray crosses the boundary of a leaf.
@@ -160,7 +114,7 @@ impl Scratch {
                 let is_start = self.events[next..end].iter().any(|event| event.t == 0.0);
                 let t = if is_start { 0.0 } else { event.t };
                 if t >= 0.0 {
-                    self.crossings.push(Crossing { t, part: 6 * leaf + face });
+                    self.crossings.push(Crossing { t, part: Part::new(leaf, face) });
                 }
             }
             next = end;

@@ -1,9 +1,6 @@
 //! Where a ray meets a triangle.
 
-use glam::DVec3;
-
 use super::ray::{Projected, edge, exact_edge, side};
-use crate::prepared::power_of_two_below_inverse;
 
 /// The distance at which the ray crosses the triangle as it sees it, in units of its direction,
 /// before or behind its origin; `None` where it passes by.
@@ -51,13 +48,3 @@ pub(crate) fn hit_triangle_in_doubt(
 
 /// The sine of the angle between a ray and a face below which the face is as good as seen edge-on.
 pub(crate) const EDGE_ON: f64 = 1.0 / 1_048_576.0;
-
-/// The unit normal towards the side that sees the corners counter-clockwise. Edges are first
-/// scaled by a power of two, so that no triangle is too small for its area to be a number.
-pub(crate) fn triangle_normal([a, b, c]: [DVec3; 3]) -> DVec3 {
-    let (u, v) = (b - a, c - a);
-    let u = u * power_of_two_below_inverse(u.abs().max_element());
-    let v = v * power_of_two_below_inverse(v.abs().max_element());
-    let normal = u.cross(v);
-    normal / normal.length()
-}

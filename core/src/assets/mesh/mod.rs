@@ -10,8 +10,9 @@ mod stl;
 
 use std::fmt;
 
-use glam::DVec3;
 use hashbrown::{HashTable, hash_table::Entry};
+
+use glam::DVec3;
 
 use crate::{
     exact::{

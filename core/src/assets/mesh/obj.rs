@@ -2,9 +2,9 @@
 //! (.obj)", Advanced Visualizer manual, appendix B1.
 
 use super::{MeshBuilder, MeshError, MeshFault, MeshFile};
-use crate::{
-    language::lexer::{Class, class},
-    text::number::scan_number,
+use crate::text::{
+    bytes::{Class, class},
+    number::scan_number,
 };
 
 /// Reads a file.

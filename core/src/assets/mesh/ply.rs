@@ -2,9 +2,9 @@
 //! vertices; all else is skipped. Source: Turk, "The PLY Polygon File Format" (1994).
 
 use super::{MeshBuilder, MeshError, MeshFault, MeshFile, MeshPlace};
-use crate::{
-    language::lexer::{Class, class},
-    text::number::scan_number,
+use crate::text::{
+    bytes::{Class, class},
+    number::scan_number,
 };
 
 /// Whether bytes begin as a PLY file does.

@@ -1,9 +1,9 @@
 //! STL files. Source: 3D Systems, "Stereo Lithography Interface Specification" (1989).
 
 use super::{MeshBuilder, MeshError, MeshFault, MeshFile, MeshPlace};
-use crate::{
-    language::lexer::{Class, class},
-    text::number::scan_number,
+use crate::text::{
+    bytes::{Class, class},
+    number::scan_number,
 };
 
 /// A header of 80 bytes and the number of triangles.

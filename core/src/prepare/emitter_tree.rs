@@ -1,0 +1,81 @@
+//! A binary tree over all emitters.
+
+use glam::DVec3;
+
+use crate::prepared::record::{EmitterNode, EmitterRecord, NO_NODE};
+
+/// What the tree is made of: an emitter's bounding ball, its area and what it sends on.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Twig {
+    pub(crate) center: DVec3,
+    pub(crate) radius: f64,
+    pub(crate) area: f64,
+}
+
+/// Builds the tree over `emitters`, of which `twigs` tells more, and enters their nodes in them.
+/// The root is node 0, two children stand side by side after their parent.
+pub(crate) fn build_tree(emitters: &mut [EmitterRecord], twigs: &[Twig]) -> Vec<EmitterNode> {
+    if emitters.is_empty() {
+        return Vec::new();
+    }
+    let mut order: Vec<u32> = (0..emitters.len() as u32).collect();
+    let mut nodes = vec![EmitterNode::leaf(NO_NODE, 0)];
+    // Nodes to make, of runs of the order.
+    let mut waiting = vec![(0_usize, 0..emitters.len())];
+    while let Some((index, run)) = waiting.pop() {
+        let parent = nodes[index].parent;
+        let part = &mut order[run.clone()];
+        if let [emitter] = *part {
+            nodes[index] = EmitterNode::leaf(parent, emitter);
+            emitters[emitter as usize].node = index as u32;
+            continue;
+        }
+        let (mut low, mut high) = (DVec3::INFINITY, DVec3::NEG_INFINITY);
+        let (mut min, mut max) = (low, high);
+        let (mut area, mut power) = (0.0, 0.0);
+        for &emitter in part.iter() {
+            let Twig { center, radius, area: own } = twigs[emitter as usize];
+            (low, high) = (low.min(center), high.max(center));
+            (min, max) = (min.min(center - radius), max.max(center + radius));
+            area += own;
+            let [front, back] = emitters[emitter as usize].radiosity;
+            power += own * front.max(back);
+        }
+        let extent = high - low;
+        let axis = if extent.x >= extent.max_element() {
+            0
+        } else if extent.y >= extent.z {
+            1
+        } else {
+            2
+        };
+        let center = min + (max - min) / 2.0;
+        let reach = |&emitter: &u32| {
+            let Twig { center: of_emitter, radius, .. } = twigs[emitter as usize];
+            (of_emitter - center).length() + radius
+        };
+        let radius = part.iter().map(reach).fold(0.0, f64::max);
+        let middle = part.len() / 2;
+        part.select_nth_unstable_by(middle, |&a, &b| {
+            let place = |emitter: u32| twigs[emitter as usize].center[axis];
+            place(a).total_cmp(&place(b)).then(a.cmp(&b))
+        });
+        let child = nodes.len();
+        // Half of the area is turned away.
+        let fill = (area / (std::f64::consts::TAU * (radius * radius))).min(1.0);
+        nodes[index] = EmitterNode {
+            center: center.to_array(),
+            radius,
+            fill,
+            radiosity: power / area,
+            parent,
+            child: child as u32,
+            emitter: u32::MAX,
+            padding: 0,
+        };
+        nodes.extend([EmitterNode::leaf(index as u32, 0); 2]);
+        waiting.push((child, run.start..run.start + middle));
+        waiting.push((child + 1, run.start + middle..run.end));
+    }
+    nodes
+}

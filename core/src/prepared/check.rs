@@ -1,0 +1,207 @@
+//! What readers of a prepared scene rely on, checked once when it is opened.
+
+use super::{
+    layout::View,
+    node::{Child, MOST_LEVELS, Node},
+    record::{
+        EmitterNode, EmitterRecord, Kind, LEAF, LeafRecord, MaterialRecord, NO_NODE, NodeRecord,
+        PlaneIndex, TexturedFace,
+    },
+};
+
+/// Everything that readers rely on.
+pub(super) fn check(view: &View<'_>) -> Result<(), &'static str> {
+    let ensure = |holds: bool, what: &'static str| if holds { Ok(()) } else { Err(what) };
+    let finite = |numbers: &[f64]| numbers.iter().all(|x| x.is_finite() && x.abs() < 1e100);
+    let header = view.header;
+
+    let camera = &header.camera;
+    for vector in [camera.eye, camera.top_left, camera.right, camera.down] {
+        ensure(finite(&vector), "the camera")?;
+    }
+    let lighting = &header.lighting;
+    ensure(finite(&lighting.background) && finite(&lighting.ambient), "a colour")?;
+    let is_scale = |x: f64| x.is_normal() && x > 0.0 && (1.0 / x).is_normal();
+    ensure(is_scale(header.scale) && is_scale(header.frame.scale), "a scale")?;
+    ensure(finite(&header.frame.origin), "the frame")?;
+
+    let mut levels = vec![0_u8; view.nodes.len()];
+    *levels.first_mut().ok_or("no root")? = 1;
+    for (index, node) in view.nodes.iter().enumerate() {
+        ensure(levels[index] > 0, "a node without a parent")?;
+        ensure(node.planes.as_flattened().iter().all(|x| !x.is_nan()), "a box")?;
+        for (k, &child) in node.children.iter().enumerate() {
+            if child == Child::NONE {
+                // Its box is what keeps rays from going there, to the root again.
+                let is_empty = |side: usize| node.planes[side][k] == Node::EMPTY.planes[side][k];
+                ensure((0..6).all(is_empty), "a box")?;
+                continue;
+            }
+            if child.is_leaf() {
+                ensure(child.items().end <= view.items.len(), "a leaf")?;
+                continue;
+            }
+            let below = levels[index] + 1;
+            let level = levels.get_mut(child.node()).ok_or("a child")?;
+            // One parent each, standing before it: no loops, and no node is visited twice.
+            ensure(*level == 0 && child.node() > index, "a child")?;
+            ensure(usize::from(below) <= MOST_LEVELS, "too many levels")?;
+            *level = below;
+        }
+    }
+    for item in view.items {
+        let count = match item.kind().ok_or("an item")? {
+            Kind::Triangle => view.triangles.len(),
+            Kind::Coplanar => view.coplanars.len(),
+            Kind::Quadrangle => view.quadrangles.len(),
+            Kind::Sphere => view.spheres.len(),
+            Kind::Solid => view.solids.len(),
+        };
+        ensure(item.index() < count, "an item")?;
+    }
+    ensure(view.vertices.iter().all(|vertex| finite(vertex)), "a vertex")?;
+    let vertices = |indices: &[u32]| indices.iter().all(|&k| (k as usize) < view.vertices.len());
+    let material = |index: u32| (index as usize) < view.materials.len();
+    let plane = |index: PlaneIndex| index.index() < view.planes.len();
+    for face in view.triangles {
+        ensure(vertices(&face.vertices) && material(face.material), "a triangle")?;
+    }
+    for face in view.coplanars {
+        let whole = vertices(&face.vertices) && material(face.material) && plane(face.plane);
+        ensure(whole, "a triangle")?;
+    }
+    for face in view.quadrangles {
+        let whole = vertices(&face.vertices) && material(face.material) && plane(face.plane);
+        ensure(whole, "a quadrangle")?;
+    }
+    for sphere in view.spheres {
+        let whole = finite(&sphere.center) && finite(&[sphere.radius]) && sphere.radius > 0.0;
+        ensure(whole && material(sphere.material), "a sphere")?;
+    }
+    for plane in view.planes {
+        ensure(finite(&plane.point) && finite(&plane.normal), "a plane")?;
+    }
+    for record in view.materials {
+        let numbers = [record.reflect, record.alpha, record.refract];
+        let is_share = |x: f64| (0.0..=1.0).contains(&x);
+        let whole = finite(&record.color) && finite(&numbers) && record.refract >= 0.0;
+        ensure(whole && is_share(record.reflect) && is_share(record.alpha), "a material")?;
+        let has_texture = (record.texture as usize) < view.textures.len();
+        ensure(has_texture || record.texture == MaterialRecord::PLAIN, "a material")?;
+    }
+    for leaf in view.leaves {
+        let whole = finite(&leaf.center) && finite(&[leaf.radius]) && material(leaf.material);
+        let is_shape = leaf.is_sphere() || leaf.planes.iter().all(|&index| plane(index));
+        ensure(whole && is_shape, "a leaf")?;
+    }
+    for solid in view.solids {
+        ensure(solid.nodes().end <= view.solid_nodes.len(), "a solid")?;
+        ensure(solid.leaves().end <= view.leaves.len(), "a solid")?;
+        let leaves = view.solid_leaves(solid);
+        check_solid_tree(view.solid_nodes(solid), leaves).map_err(|()| "a solid's tree")?;
+        let last_rank = u64::from(solid.rank) + 6 * leaves.len() as u64;
+        ensure(last_rank <= Child::ITEM_LIMIT as u64, "a solid")?;
+    }
+    for light in view.lights {
+        let is_finite = light.intensity.iter().all(|channel| channel.is_finite());
+        ensure(finite(&light.position) && is_finite, "a light")?;
+        let end = light.touches_first as usize + light.touches_count as usize;
+        ensure(end <= view.touches.len(), "a light")?;
+    }
+    check_textures(view)?;
+    check_emitters(view)
+}
+
+/// What those rely on who look at textures.
+fn check_textures(view: &View<'_>) -> Result<(), &'static str> {
+    let ensure = |holds: bool, what: &'static str| if holds { Ok(()) } else { Err(what) };
+    let finite = |numbers: &[f64]| numbers.iter().all(|x| x.is_finite() && x.abs() < 1e100);
+    let is_sorted = view.textured_faces.is_sorted_by(|a, b| a.rank < b.rank);
+    ensure(is_sorted, "the textured faces' order")?;
+    let texcoords = |face: &TexturedFace| finite(face.texcoords.0.as_flattened());
+    ensure(view.textured_faces.iter().all(texcoords), "a texture coordinate")?;
+    for texture in view.textures {
+        let levels = view.texture_levels.get(texture.levels()).ok_or("a texture")?;
+        let (finest, coarser) = levels.split_first().ok_or("a texture")?;
+        ensure(finest.lies_within(view.fine_texels.len()), "a texture")?;
+        let are_within = coarser.iter().all(|level| level.lies_within(view.coarse_texels.len()));
+        ensure(are_within, "a texture's level")?;
+    }
+    let texels = view.coarse_texels.as_flattened();
+    ensure(texels.iter().all(|channel| (0.0..=1.0).contains(channel)), "a texel")
+}
+
+/// What those rely on who aim at emitters.
+fn check_emitters(view: &View<'_>) -> Result<(), &'static str> {
+    let ensure = |holds: bool, what: &'static str| if holds { Ok(()) } else { Err(what) };
+    let finite = |numbers: &[f64]| numbers.iter().all(|x| x.is_finite() && x.abs() < 1e100);
+    let vertices = |emitter: &EmitterRecord| {
+        emitter.vertices.iter().all(|&k| (k as usize) < view.vertices.len()) || emitter.is_sphere()
+    };
+    for emitter in view.emitters {
+        let is_place = finite(&emitter.middle) && finite(&emitter.turned_area);
+        let is_shape = is_place && finite(&[emitter.size]) && emitter.size > 0.0;
+        let is_known = emitter.shape <= EmitterRecord::SPHERE && vertices(emitter);
+        ensure((emitter.by_size as usize) < view.emitters.len(), "an emitter")?;
+        let is_light = emitter.radiosity.iter().all(|&x| (0.0..=1e100).contains(&x));
+        ensure(is_shape && is_known && is_light, "an emitter")?;
+    }
+    ensure(view.emitters.is_sorted_by(|a, b| a.rank < b.rank), "the emitters' order")?;
+    for node in view.emitter_nodes {
+        let numbers = [node.radius, node.fill, node.radiosity];
+        let is_ball = finite(&node.center) && numbers.iter().all(|&x| (0.0..=1e100).contains(&x));
+        ensure(is_ball, "a node of emitters")?;
+    }
+    check_emitter_tree(view.emitter_nodes, view.emitters).map_err(|()| "the tree of emitters")
+}
+
+/// Whether nodes are a tree over these leaves in postfix order, so that walking it ends.
+fn check_solid_tree(nodes: &[NodeRecord], leaves: &[LeafRecord]) -> Result<(), ()> {
+    let ensure = |holds: bool| if holds { Ok(()) } else { Err(()) };
+    ensure(nodes.last().is_some_and(|root| root.parent == NO_NODE))?;
+    let mut owners = vec![NO_NODE; nodes.len()];
+    let mut is_taken = vec![false; leaves.len()];
+    for (index, node) in (0..).zip(nodes) {
+        if node.operation == LEAF {
+            let leaf = leaves.get(node.first_child as usize).ok_or(())?;
+            let is_free = !std::mem::replace(&mut is_taken[node.first_child as usize], true);
+            ensure(is_free && leaf.node == index)?;
+            continue;
+        }
+        ensure(node.operation < LEAF && node.operands >= 2)?;
+        let mut child = node.first_child;
+        for operand in 0..node.operands {
+            ensure(child < index && owners[child as usize] == NO_NODE)?;
+            owners[child as usize] = index;
+            ensure((nodes[child as usize].is_first == 1) == (operand == 0))?;
+            child = nodes[child as usize].next;
+        }
+        ensure(child == NO_NODE)?;
+    }
+    ensure(is_taken.iter().all(|&taken| taken))?;
+    ensure(nodes.iter().zip(&owners).all(|(node, &owner)| node.parent == owner))
+}
+
+/// Whether nodes are such a tree over the emitters: every walk up or down ends.
+fn check_emitter_tree(nodes: &[EmitterNode], emitters: &[EmitterRecord]) -> Result<(), ()> {
+    let ensure = |holds: bool| if holds { Ok(()) } else { Err(()) };
+    ensure(nodes.len() == (2 * emitters.len()).saturating_sub(1))?;
+    let mut parents = vec![NO_NODE; nodes.len()];
+    for (index, node) in (0..).zip(nodes) {
+        ensure(node.parent == parents[index as usize])?;
+        ensure((node.parent == NO_NODE) == (index == 0))?;
+        if node.is_leaf() {
+            let emitter = emitters.get(node.emitter as usize).ok_or(())?;
+            ensure(emitter.node == index)?;
+            continue;
+        }
+        ensure(node.child > index && (node.child as usize) < nodes.len() - 1)?;
+        for child in [node.child, node.child + 1] {
+            let parent = &mut parents[child as usize];
+            ensure(*parent == NO_NODE)?;
+            *parent = index;
+        }
+    }
+    // As many leaves as emitters, each its own emitter's.
+    ensure(emitters.iter().all(|emitter| (emitter.node as usize) < nodes.len()))
+}

@@ -1,0 +1,150 @@
+//! The order of a block: its header and its sections.
+
+use super::{
+    node::{Frame, Node},
+    record::{
+        Camera, CoplanarRecord, EmitterNode, EmitterRecord, Features, Item, LeafRecord,
+        LevelRecord, LightRecord, Lighting, MaterialRecord, NodeRecord, PlaneRecord,
+        QuadrangleRecord, SolidRecord, SphereRecord, Surface, TextureRecord, TexturedFace,
+        TriangleRecord,
+    },
+};
+
+pub(super) const MAGIC: [u8; 8] = *b"rtfarm\r\n";
+
+/// Changes with the layout or the meaning of any byte.
+pub(super) const VERSION: u32 = 6;
+
+/// Reads differently on a machine of the other byte order.
+pub(super) const BYTE_ORDER: u32 = 0x0102_0304;
+
+#[derive(Debug, Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
+#[repr(C)]
+pub(crate) struct Header {
+    pub(super) magic: [u8; 8],
+    pub(super) version: u32,
+    pub(super) byte_order: u32,
+    /// BLAKE3 of everything behind this field, and the scene's address.
+    pub(super) hash: [u8; 32],
+    pub(super) sections: [Section; SECTIONS],
+    pub(crate) camera: Camera,
+    pub(crate) frame: Frame,
+    pub(crate) lighting: Lighting,
+    /// Scene coordinates times this are the block's: a power of two.
+    pub(crate) scale: f64,
+    pub(crate) features: Features,
+}
+
+pub(super) const HASHED_FROM: usize = 16 + 32;
+
+#[derive(Debug, Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
+#[repr(C)]
+pub(super) struct Section {
+    /// From the start of the block, in bytes.
+    pub(super) offset: u64,
+    /// Records.
+    pub(super) count: u64,
+}
+
+/// Declares the sections of a block, once for all that go through them in order.
+macro_rules! sections {
+    ($($name:ident: $record:ty,)*) => {
+        /// The sections of a block, in their order.
+        #[derive(Debug, Clone, Copy)]
+        pub(crate) struct Sections<'a> {
+            $(pub(crate) $name: &'a [$record],)*
+        }
+
+        const SECTIONS: usize = [$(stringify!($name)),*].len();
+
+        /// The record sizes of the sections, in their order.
+        pub(super) const RECORD_SIZES: [usize; SECTIONS] = [$(size_of::<$record>()),*];
+
+        impl<'a> Sections<'a> {
+            pub(super) fn to_bytes(self) -> [&'a [u8]; SECTIONS] {
+                [$(bytemuck::cast_slice(self.$name)),*]
+            }
+
+            pub(super) fn from_bytes(sections: [&'a [u8]; SECTIONS]) -> Self {
+                let [$($name),*] = sections;
+                Self { $($name: bytemuck::cast_slice($name),)* }
+            }
+        }
+    };
+}
+
+sections! {
+    nodes: Node,
+    items: Item,
+    vertices: [f64; 3],
+    triangles: TriangleRecord,
+    coplanars: CoplanarRecord,
+    quadrangles: QuadrangleRecord,
+    spheres: SphereRecord,
+    planes: PlaneRecord,
+    materials: MaterialRecord,
+    lights: LightRecord,
+    touches: Surface,
+    solids: SolidRecord,
+    solid_nodes: NodeRecord,
+    leaves: LeafRecord,
+    first_ranks: u32,
+    emitters: EmitterRecord,
+    emitter_nodes: EmitterNode,
+    textured_faces: TexturedFace,
+    textures: TextureRecord,
+    texture_levels: LevelRecord,
+    fine_texels: [u8; 4],
+    coarse_texels: [f32; 3],
+}
+
+/// A block as the tracer reads it.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct View<'a> {
+    pub(crate) header: &'a Header,
+    pub(super) sections: Sections<'a>,
+}
+
+impl<'a> std::ops::Deref for View<'a> {
+    type Target = Sections<'a>;
+
+    #[inline(always)]
+    fn deref(&self) -> &Sections<'a> {
+        &self.sections
+    }
+}
+
+impl<'a> View<'a> {
+    /// The surfaces that contain the light.
+    #[inline(always)]
+    pub(crate) fn touches(&self, light: &LightRecord) -> &'a [Surface] {
+        let first = light.touches_first as usize;
+        &self.touches[first..first + light.touches_count as usize]
+    }
+
+    pub(crate) fn solid_nodes(&self, solid: &SolidRecord) -> &'a [NodeRecord] {
+        &self.sections.solid_nodes[solid.nodes()]
+    }
+
+    pub(crate) fn solid_leaves(&self, solid: &SolidRecord) -> &'a [LeafRecord] {
+        &self.sections.leaves[solid.leaves()]
+    }
+
+    /// The emitter of a rank.
+    pub(crate) fn emitter_of(&self, rank: u32) -> Option<u32> {
+        self.emitters.binary_search_by_key(&rank, |emitter| emitter.rank).ok().map(|k| k as u32)
+    }
+
+    /// The primitive and its face that have a rank.
+    pub(crate) fn primitive_and_face(&self, rank: u32) -> (u32, u32) {
+        match self.first_ranks.partition_point(|&first| first <= rank).checked_sub(1) {
+            Some(primitive) => (primitive as u32, rank - self.first_ranks[primitive]),
+            None => (rank, 0),
+        }
+    }
+
+    #[inline(always)]
+    pub(crate) fn corners<const N: usize>(&self, vertices: &[u32; N]) -> [&'a [f64; 3]; N] {
+        vertices.map(|vertex| &self.vertices[vertex as usize])
+    }
+}

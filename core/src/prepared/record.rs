@@ -1,0 +1,529 @@
+//! The records that a prepared scene is made of.
+
+use std::ops::Range;
+
+use glam::DVec3;
+
+use crate::{exact::float::power_of_two_below_inverse, left_out, transfer::Transfer};
+
+/// What the scene needs of the tracer; 1 or 0 each.
+#[derive(Debug, Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
+#[repr(C)]
+pub(crate) struct Features {
+    /// The scene defines light; else it shows plain colours.
+    pub(crate) is_lit: u32,
+    /// Something mirrors or lets light through.
+    pub(crate) has_branches: u32,
+    /// A shadow may let light through.
+    pub(crate) has_clear_shadows: u32,
+    /// There are constructive solids.
+    pub(crate) has_solids: u32,
+    /// Faces send light on to others: [`Features::AIMED`] or [`Features::UNAIMED`].
+    pub(crate) has_emitters: u32,
+    /// A face shows an image.
+    pub(crate) has_textures: u32,
+    /// The images' finest levels are encoded by the sRGB curve.
+    pub(crate) has_srgb_texels: u32,
+    pub(crate) padding: u32,
+}
+
+impl Features {
+    /// Light is looked for where emitters are, as well as all over the sky.
+    pub(crate) const AIMED: u32 = 1;
+    /// Only all over the sky, by one ray from each place: the yardstick.
+    pub(crate) const UNAIMED: u32 = 2;
+
+    pub(crate) fn has_branches(&self) -> bool {
+        self.has_branches == 1
+    }
+
+    pub(crate) fn has_clear_shadows(&self) -> bool {
+        self.has_clear_shadows == 1 && !left_out::TRANSPARENCY
+    }
+
+    pub(crate) fn has_emitters(&self) -> bool {
+        self.has_emitters != 0 && !left_out::SECONDARY_LIGHT
+    }
+
+    pub(crate) fn has_textures(&self) -> bool {
+        self.has_textures == 1 && !left_out::TEXTURE
+    }
+
+    pub(crate) fn texel_transfer(&self) -> Transfer {
+        if self.has_srgb_texels == 1 { Transfer::Srgb } else { Transfer::None }
+    }
+}
+
+/// Light that comes from everywhere.
+#[derive(Debug, Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
+#[repr(C)]
+pub(crate) struct Lighting {
+    pub(crate) background: [f64; 3],
+    pub(crate) ambient: [f64; 3],
+}
+
+impl Lighting {
+    /// What a surface receives before any lamp is asked.
+    pub(crate) fn ambient(&self) -> DVec3 {
+        if left_out::AMBIENT { DVec3::ZERO } else { DVec3::from_array(self.ambient) }
+    }
+}
+
+/// The eye and the screen as seen from it. The screen only gives directions, so it has a scale of
+/// its own: one that is nothing beside the scene still does not underflow.
+#[derive(Debug, Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
+#[repr(C)]
+pub(crate) struct Camera {
+    pub(crate) eye: [f64; 3],
+    /// From the eye to the screen's top left corner.
+    pub(crate) top_left: [f64; 3],
+    /// From the top left corner to the top right one.
+    pub(crate) right: [f64; 3],
+    /// From the top left corner to the bottom left one.
+    pub(crate) down: [f64; 3],
+}
+
+impl Camera {
+    pub(super) fn with_screen_of_one(self) -> Self {
+        let screen = [self.top_left, self.right, self.down].map(DVec3::from_array);
+        let largest =
+            screen.map(|vector| vector.abs().max_element()).into_iter().fold(0.0, f64::max);
+        let scale = power_of_two_below_inverse(largest);
+        let [top_left, right, down] = screen.map(|vector| (vector * scale).to_array());
+        Self { top_left, right, down, ..self }
+    }
+}
+
+/// A surface, for leaving it: all faces in exactly one plane, all equal spheres, or else one face.
+/// (A ray that starts in a plane never meets that plane again.)
+#[derive(Debug, Clone, Copy, PartialEq, Eq, bytemuck::Pod, bytemuck::Zeroable)]
+#[repr(transparent)]
+pub(crate) struct Surface(pub(crate) u32);
+
+impl Surface {
+    /// A ray that starts in free space.
+    pub(crate) const NONE: Self = Self(u32::MAX);
+}
+
+/// A face in the prepared scene: its kind in the upper 3 bits, its index among its kind below.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, bytemuck::Pod, bytemuck::Zeroable)]
+#[repr(transparent)]
+pub(crate) struct Item(u32);
+
+/// The kinds of faces.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Kind {
+    /// A triangle alone in its plane.
+    Triangle = 0,
+    /// A triangle that shares its plane with other faces.
+    Coplanar = 1,
+    /// A quadrangle.
+    Quadrangle = 2,
+    /// A sphere.
+    Sphere = 3,
+    /// A constructive solid.
+    Solid = 4,
+}
+
+impl Item {
+    /// No face.
+    pub(crate) const NONE: Self = Self(u32::MAX);
+    /// How many faces of one kind a scene may have.
+    pub(crate) const LIMIT: usize = 1 << 29;
+
+    /// A face of the given kind.
+    pub(crate) fn new(kind: Kind, index: usize) -> Self {
+        debug_assert!(index < Self::LIMIT);
+        Self((kind as u32) << 29 | index as u32)
+    }
+
+    /// The kind; `None` for bits that no kind has.
+    #[inline(always)]
+    pub(crate) fn kind(self) -> Option<Kind> {
+        match self.0 >> 29 {
+            0 => Some(Kind::Triangle),
+            1 => Some(Kind::Coplanar),
+            2 => Some(Kind::Quadrangle),
+            3 => Some(Kind::Sphere),
+            4 if !left_out::SOLID => Some(Kind::Solid),
+            _ => None,
+        }
+    }
+
+    /// The index among the faces of its kind.
+    #[inline(always)]
+    pub(crate) fn index(self) -> usize {
+        (self.0 & (Self::LIMIT as u32 - 1)) as usize
+    }
+}
+
+#[derive(Debug, Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
+#[repr(C)]
+pub(crate) struct TriangleRecord {
+    pub(crate) vertices: [u32; 3],
+    pub(crate) material: u32,
+    pub(crate) rank: u32,
+}
+
+#[derive(Debug, Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
+#[repr(C)]
+pub(crate) struct CoplanarRecord {
+    pub(crate) vertices: [u32; 3],
+    pub(crate) material: u32,
+    pub(crate) rank: u32,
+    pub(crate) plane: PlaneIndex,
+}
+
+#[derive(Debug, Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
+#[repr(C)]
+pub(crate) struct QuadrangleRecord {
+    pub(crate) vertices: [u32; 4],
+    pub(crate) material: u32,
+    pub(crate) rank: u32,
+    pub(crate) plane: PlaneIndex,
+    padding: u32,
+}
+
+impl QuadrangleRecord {
+    pub(crate) fn new(vertices: [u32; 4], material: u32, rank: u32, plane: PlaneIndex) -> Self {
+        Self { vertices, material, rank, plane, padding: 0 }
+    }
+}
+
+#[derive(Debug, Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
+#[repr(C)]
+pub(crate) struct SphereRecord {
+    pub(crate) center: [f64; 3],
+    pub(crate) radius: f64,
+    pub(crate) material: u32,
+    pub(crate) rank: u32,
+    /// Equal spheres have one surface.
+    pub(crate) surface: u32,
+    padding: u32,
+}
+
+impl SphereRecord {
+    pub(crate) fn new(center: DVec3, radius: f64, material: u32, rank: u32) -> Self {
+        Self { center: center.to_array(), radius, material, rank, surface: rank, padding: 0 }
+    }
+}
+
+/// A constructive solid: runs of nodes and of leaves.
+#[derive(Debug, Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
+#[repr(C)]
+pub(crate) struct SolidRecord {
+    first_node: u32,
+    node_count: u32,
+    first_leaf: u32,
+    leaf_count: u32,
+    /// The rank of its first leaf's first face; each leaf has six.
+    pub(crate) rank: u32,
+}
+
+impl SolidRecord {
+    pub(crate) fn new(nodes: Range<usize>, leaves: Range<usize>, rank: u32) -> Self {
+        Self {
+            first_node: nodes.start as u32,
+            node_count: nodes.len() as u32,
+            first_leaf: leaves.start as u32,
+            leaf_count: leaves.len() as u32,
+            rank,
+        }
+    }
+
+    pub(crate) fn nodes(&self) -> Range<usize> {
+        self.first_node as usize..self.first_node as usize + self.node_count as usize
+    }
+
+    pub(crate) fn leaves(&self) -> Range<usize> {
+        self.first_leaf as usize..self.first_leaf as usize + self.leaf_count as usize
+    }
+}
+
+/// What joins a node's operands.
+pub(crate) const UNION: u32 = 0;
+
+pub(crate) const INTERSECTION: u32 = 1;
+
+pub(crate) const DIFFERENCE: u32 = 2;
+
+/// A node that is a leaf; `first_child` is its number among the solid's leaves.
+pub(crate) const LEAF: u32 = 3;
+
+/// No such node.
+pub(crate) const NO_NODE: u32 = u32::MAX;
+
+/// A node of a solid's tree. Indices count from the solid's first node; children stand before
+/// their parents.
+#[derive(Debug, Clone, Copy, PartialEq, bytemuck::Pod, bytemuck::Zeroable)]
+#[repr(C)]
+pub(crate) struct NodeRecord {
+    pub(crate) operation: u32,
+    pub(crate) parent: u32,
+    pub(crate) first_child: u32,
+    /// The parent's next operand.
+    pub(crate) next: u32,
+    /// How many operands.
+    pub(crate) operands: u32,
+    /// 1 for the operand of a difference that the others are taken from.
+    pub(crate) is_first: u32,
+}
+
+/// A leaf of a constructive solid: a sphere, or a parallelepiped by its planes.
+#[derive(Debug, Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
+#[repr(C)]
+pub(crate) struct LeafRecord {
+    pub(crate) center: [f64; 3],
+    /// 0 for a parallelepiped.
+    pub(crate) radius: f64,
+    /// Of a parallelepiped; they look outward.
+    pub(crate) planes: [PlaneIndex; 6],
+    pub(crate) material: u32,
+    /// Its node in the solid's tree.
+    pub(crate) node: u32,
+    /// 1 when it is taken away: its faces look inward.
+    pub(crate) is_turned: u32,
+    /// Of a sphere.
+    pub(crate) surface: u32,
+}
+
+impl LeafRecord {
+    pub(crate) fn sphere(center: DVec3, radius: f64, material: u32, node: u32) -> Self {
+        Self { center: center.to_array(), radius, ..Self::parallelepiped(material, node) }
+    }
+
+    pub(crate) fn parallelepiped(material: u32, node: u32) -> Self {
+        let planes = [PlaneIndex(0); 6];
+        Self { center: [0.0; 3], radius: 0.0, planes, material, node, is_turned: 0, surface: 0 }
+    }
+
+    #[inline(always)]
+    pub(crate) fn is_sphere(&self) -> bool {
+        self.radius > 0.0
+    }
+
+    /// The surface of one of its faces.
+    #[inline(always)]
+    pub(crate) fn surface(&self, face: usize) -> Surface {
+        if self.is_sphere() { Surface(self.surface) } else { self.planes[face].surface() }
+    }
+}
+
+/// A plane that faces share.
+#[derive(Debug, Clone, Copy, PartialEq, bytemuck::Pod, bytemuck::Zeroable)]
+#[repr(C)]
+pub(crate) struct PlaneRecord {
+    pub(crate) point: [f64; 3],
+    /// Of length 1.
+    pub(crate) normal: [f64; 3],
+}
+
+/// An index of a plane; bit 31 says that the face looks the other way.
+#[derive(Debug, Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
+#[repr(transparent)]
+pub(crate) struct PlaneIndex(u32);
+
+impl PlaneIndex {
+    pub(crate) fn new(index: usize, is_turned: bool) -> Self {
+        Self(index as u32 | u32::from(is_turned) << 31)
+    }
+
+    #[inline(always)]
+    pub(crate) fn index(self) -> usize {
+        (self.0 & !(1 << 31)) as usize
+    }
+
+    /// 1, or -1 where the face looks against the plane's normal.
+    pub(crate) fn sign(self) -> f64 {
+        if self.0 >> 31 == 1 { -1.0 } else { 1.0 }
+    }
+
+    /// All faces of a plane are one surface.
+    #[inline(always)]
+    pub(crate) fn surface(self) -> Surface {
+        Surface(self.0 | 1 << 31)
+    }
+}
+
+#[derive(Debug, Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
+#[repr(C)]
+pub(crate) struct MaterialRecord {
+    pub(crate) color: [f64; 3],
+    /// The mirrored share.
+    pub(crate) reflect: f64,
+    /// The share of the rest that is the surface's own.
+    pub(crate) alpha: f64,
+    /// n1/n2 from the front; 0 and 1 do not bend.
+    pub(crate) refract: f64,
+    /// The image that multiplies `color` on faces with texture coordinates, or [`Self::PLAIN`].
+    pub(crate) texture: u32,
+    padding: u32,
+}
+
+impl MaterialRecord {
+    /// No texture.
+    pub(crate) const PLAIN: u32 = u32::MAX;
+
+    pub(crate) fn new(color: DVec3, [reflect, alpha, refract]: [f64; 3], texture: u32) -> Self {
+        Self { color: color.to_array(), reflect, alpha, refract, texture, padding: 0 }
+    }
+
+    /// Whether faces send light on to others.
+    pub(crate) fn emits(&self) -> bool {
+        self.reflect * self.alpha * DVec3::from_array(self.color).max_element() > 0.0
+    }
+
+    /// What a shadow ray keeps when it crosses a face.
+    pub(crate) fn clearness(&self) -> f64 {
+        (1.0 - self.alpha) * (1.0 - self.reflect)
+    }
+}
+
+#[derive(Debug, Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
+#[repr(C)]
+pub(crate) struct LightRecord {
+    pub(crate) position: [f64; 3],
+    pub(crate) intensity: [f64; 3],
+    /// The faces that contain the light: a run of `touches`.
+    pub(super) touches_first: u32,
+    pub(super) touches_count: u32,
+}
+
+impl LightRecord {
+    pub(crate) fn new(position: DVec3, intensity: DVec3, first: u32, count: u32) -> Self {
+        Self {
+            position: position.to_array(),
+            intensity: intensity.to_array(),
+            touches_first: first,
+            touches_count: count,
+        }
+    }
+}
+
+/// A face that sends light on to others. Records are sorted by rank.
+#[derive(Debug, Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
+#[repr(C)]
+pub(crate) struct EmitterRecord {
+    /// The centre of a sphere, the mean of a polygon's corners.
+    pub(crate) middle: [f64; 3],
+    /// Of a polygon: its normal times its area.
+    pub(crate) turned_area: [f64; 3],
+    /// The radius, or the area. Above 0.
+    pub(crate) size: f64,
+    /// About what each side sends on at most, in its brightest channel; of a polygon the side that
+    /// `turned_area` leads to first.
+    pub(crate) radiosity: [f64; 2],
+    /// Of a polygon: the diagonal from the first to the third lies inside; the third of a triangle
+    /// stands there twice.
+    pub(crate) vertices: [u32; 4],
+    pub(crate) rank: u32,
+    pub(crate) shape: u32,
+    /// Its leaf in the tree.
+    pub(crate) node: u32,
+    /// Of the record that stands at the same place in the order of sizes, the largest first: its
+    /// index.
+    pub(crate) by_size: u32,
+}
+
+impl EmitterRecord {
+    pub(crate) const TRIANGLE: u32 = 0;
+    pub(crate) const QUADRANGLE: u32 = 1;
+    pub(crate) const SPHERE: u32 = 2;
+
+    #[inline(always)]
+    pub(crate) fn is_sphere(&self) -> bool {
+        self.shape == Self::SPHERE
+    }
+
+    #[inline(always)]
+    pub(crate) fn is_triangle(&self) -> bool {
+        self.shape == Self::TRIANGLE
+    }
+}
+
+/// A node of the tree over all emitters.
+#[derive(Debug, Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
+#[repr(C)]
+pub(crate) struct EmitterNode {
+    /// Of a ball around its emitters.
+    pub(crate) center: [f64; 3],
+    pub(crate) radius: f64,
+    /// About the share of that ball's disc that they fill. 0..=1.
+    pub(crate) fill: f64,
+    /// What they send on, by their areas.
+    pub(crate) radiosity: f64,
+    pub(crate) parent: u32,
+    /// The first of two, side by side; not of a leaf.
+    pub(crate) child: u32,
+    /// Of a leaf.
+    pub(crate) emitter: u32,
+    pub(crate) padding: u32,
+}
+
+impl EmitterNode {
+    pub(crate) fn leaf(parent: u32, emitter: u32) -> Self {
+        let child = NO_NODE;
+        Self { parent, child, emitter, ..bytemuck::Zeroable::zeroed() }
+    }
+
+    #[inline(always)]
+    pub(crate) fn is_leaf(&self) -> bool {
+        self.child == NO_NODE
+    }
+}
+
+/// The texture coordinates of a face.
+#[derive(Debug, Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
+#[repr(C)]
+pub(crate) struct TexturedFace {
+    pub(crate) texcoords: Texcoords,
+    pub(crate) rank: u32,
+    padding: u32,
+}
+
+impl TexturedFace {
+    pub(crate) fn new(rank: u32, texcoords: Texcoords) -> Self {
+        Self { texcoords, rank, padding: 0 }
+    }
+}
+
+/// Texture coordinates at the corners (0, 0), (1, 0), (1, 1) and (0, 1) of the unit square;
+/// bilinear between them.
+#[derive(Debug, Clone, Copy, PartialEq, bytemuck::Pod, bytemuck::Zeroable)]
+#[repr(transparent)]
+pub(crate) struct Texcoords(pub(crate) [[f64; 2]; 4]);
+
+/// An image: a run of levels.
+#[derive(Debug, Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
+#[repr(C)]
+pub(crate) struct TextureRecord {
+    pub(crate) first_level: u32,
+    /// At least 1.
+    pub(crate) level_count: u32,
+}
+
+/// An image at one size.
+#[derive(Debug, Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
+#[repr(C)]
+pub(crate) struct LevelRecord {
+    pub(crate) width: u32,
+    pub(crate) height: u32,
+    /// Of its first texel: of an image's first level among the fine ones, else among the coarse
+    /// ones.
+    pub(crate) offset: u64,
+}
+
+impl TextureRecord {
+    pub(crate) fn levels(self) -> Range<usize> {
+        self.first_level as usize..self.first_level as usize + self.level_count as usize
+    }
+}
+
+impl LevelRecord {
+    /// Whether it has texels, and they are among so many.
+    pub(crate) fn lies_within(&self, texel_count: usize) -> bool {
+        let count = u64::from(self.width) * u64::from(self.height);
+        let end = self.offset.checked_add(count);
+        count > 0 && end.is_some_and(|end| end <= texel_count as u64)
+    }
+}

@@ -1,0 +1,186 @@
+//! Which face a ray meets, kind by kind.
+
+use glam::DVec3;
+
+use super::{
+    quadrangle::{hit_plane, hit_quadrangle, is_inside},
+    ray::{Hit, Ray, Shear},
+    solid::Scratch,
+    sphere::{hit_sphere, hit_sphere_again},
+    triangle::hit_triangle,
+};
+use crate::prepared::{
+    face::{Face, Part},
+    layout::View,
+    record::{Item, Kind, Surface},
+};
+
+/// The search for the nearest face.
+pub(super) struct Nearest<'a> {
+    pub(super) ray: &'a Ray,
+    pub(super) shear: Shear,
+    pub(super) hit: Hit,
+}
+
+impl<'a> Nearest<'a> {
+    #[inline(always)]
+    pub(super) fn new(ray: &'a Ray) -> Self {
+        let shear = Shear::new(ray.origin, ray.direction);
+        Self { ray, shear, hit: Hit::none(ray.reach) }
+    }
+
+    #[inline(always)]
+    pub(super) fn meet(&mut self, view: &View<'_>, item: Item, scratch: &mut Scratch) {
+        let Some((t, rank, part)) = meet(view, self.ray, &self.shear, item, scratch) else {
+            return;
+        };
+        if t < self.hit.t || (t == self.hit.t && rank < self.hit.rank && self.hit.is_some()) {
+            self.hit = Hit { t, rank, face: Face { item, part } };
+        }
+    }
+}
+
+/// The distance at which the ray first crosses a face other than the one that it leaves, the
+/// face's rank, and which part of a solid it is. The distance is above 0, or 0 for a face that
+/// coincides with one that the ray went through and comes later.
+#[inline(always)]
+pub(super) fn meet(
+    view: &View<'_>,
+    ray: &Ray,
+    shear: &Shear,
+    item: Item,
+    scratch: &mut Scratch,
+) -> Option<(f64, u32, Part)> {
+    let index = item.index();
+    let (t, rank) = match item.kind()? {
+        Kind::Triangle => {
+            let face = &view.triangles[index];
+            let corners = shear.project_all(view.corners(&face.vertices));
+            let t = hit_triangle(corners)?;
+            if ray.leaving == Surface(face.rank) {
+                return None;
+            }
+            (t, face.rank)
+        }
+        Kind::Coplanar => {
+            let face = &view.coplanars[index];
+            let is_left = ray.leaving == face.plane.surface();
+            if is_left && face.rank <= ray.after {
+                return None;
+            }
+            let corners = shear.project_all(view.corners(&face.vertices));
+            let t = hit_triangle(corners)?;
+            if is_left {
+                return Some((0.0, face.rank, Part::WHOLE));
+            }
+            // The plane's distance, not this triangle's: coincident faces are met at one place.
+            let plane = &view.planes[face.plane.index()];
+            let [point, normal] = [plane.point, plane.normal].map(DVec3::from_array);
+            (hit_plane(ray, point, normal).unwrap_or(t), face.rank)
+        }
+        Kind::Quadrangle => {
+            let face = &view.quadrangles[index];
+            let is_left = ray.leaving == face.plane.surface();
+            if is_left && face.rank <= ray.after {
+                return None;
+            }
+            let corners = shear.project_all(view.corners(&face.vertices));
+            if is_left {
+                return is_inside(&corners).then_some((0.0, face.rank, Part::WHOLE));
+            }
+            let plane = &view.planes[face.plane.index()];
+            let [point, normal] = [plane.point, plane.normal].map(DVec3::from_array);
+            (hit_quadrangle(ray, &corners, point, normal)?, face.rank)
+        }
+        Kind::Sphere => {
+            let sphere = &view.spheres[index];
+            let center = DVec3::from_array(sphere.center);
+            let t = if ray.leaving == Surface(sphere.surface) {
+                if sphere.rank > ray.after {
+                    return Some((0.0, sphere.rank, Part::WHOLE));
+                }
+                hit_sphere_again(ray, center)
+            } else {
+                let [near, far] = hit_sphere(ray, center, sphere.radius)?;
+                if near > 0.0 { near } else { far }
+            };
+            (t, sphere.rank)
+        }
+        Kind::Solid => return meet_solid(view, ray, index, scratch),
+    };
+    (t > 0.0).then_some((t, rank, Part::WHOLE))
+}
+
+#[inline(never)]
+pub(super) fn meet_solid(
+    view: &View<'_>,
+    ray: &Ray,
+    index: usize,
+    scratch: &mut Scratch,
+) -> Option<(f64, u32, Part)> {
+    let solid = &view.solids[index];
+    scratch.cross(view, solid, ray, &[]);
+    scratch.crossings.iter().find_map(|crossing| {
+        let part = crossing.part;
+        let rank = part.rank(solid);
+        let is_met = crossing.t > 0.0
+            || (rank > ray.after && part.leaf_of(view, solid).surface(part.face()) == ray.leaving);
+        is_met.then_some((crossing.t, rank, part))
+    })
+}
+
+/// Calls `cross` with the rank and the part of every crossing of a face strictly between the
+/// ray's start and its end, which is a light that the surfaces `touches` contain.
+#[inline(always)]
+pub(super) fn between(
+    view: &View<'_>,
+    ray: &Ray,
+    shear: &Shear,
+    touches: &[Surface],
+    item: Item,
+    scratch: &mut Scratch,
+    mut cross: impl FnMut(u32, Part),
+) {
+    let index = item.index();
+    match item.kind() {
+        Some(Kind::Solid) => {
+            let solid = &view.solids[index];
+            scratch.cross(view, solid, ray, touches);
+            for crossing in &scratch.crossings {
+                if crossing.t > 0.0 && crossing.t < ray.reach {
+                    cross(crossing.part.rank(solid), crossing.part);
+                }
+            }
+        }
+        Some(Kind::Sphere) => {
+            let sphere = &view.spheres[index];
+            let center = DVec3::from_array(sphere.center);
+            let surface = Surface(sphere.surface);
+            let is_inner = |&t: &f64| t > 0.0 && t < ray.reach;
+            let ends = match (ray.leaving == surface, touches.contains(&surface)) {
+                (true, true) => return, // A chord: nothing between its ends.
+                (true, false) => [hit_sphere_again(ray, center), f64::INFINITY],
+                (false, true) => {
+                    let back = Ray { origin: ray.origin + ray.reach * ray.direction, ..*ray };
+                    [ray.reach + hit_sphere_again(&back, center), f64::INFINITY]
+                }
+                (false, false) => {
+                    hit_sphere(ray, center, sphere.radius).unwrap_or([f64::INFINITY; 2])
+                }
+            };
+            for _ in ends.iter().filter(|t| is_inner(t)) {
+                cross(sphere.rank, Part::WHOLE);
+            }
+        }
+        _ => {
+            if !touches.is_empty() && touches.contains(&Face::whole(item).surface(view)) {
+                return;
+            }
+            if let Some((t, rank, _)) = meet(view, ray, shear, item, scratch)
+                && t < ray.reach
+            {
+                cross(rank, Part::WHOLE);
+            }
+        }
+    }
+}

@@ -1,0 +1,93 @@
+//! The way of a ray through the hierarchy.
+
+use super::{
+    boxes::{BoxKernel, BoxRay},
+    ray::Ray,
+};
+use crate::prepared::{
+    layout::View,
+    node::{Child, MOST_LEVELS},
+    record::Item,
+};
+
+/// Children that may wait while a ray visits others: seven on each level and the last node's.
+const STACK: usize = 7 * MOST_LEVELS + 8;
+
+/// Room for them. A batch's rays share it: to fill it anew for each would cost as much as the ray.
+pub(super) struct Stack([(f32, Child); STACK]);
+
+impl Default for Stack {
+    fn default() -> Self {
+        Self([(0.0, Child::NONE); STACK])
+    }
+}
+
+/// What to do after a face.
+pub(super) enum Step {
+    /// Go on with what is nearer than this.
+    On(f64),
+    /// The answer is known.
+    Enough,
+}
+
+/// Calls `meet` for the faces in the leaves that the ray enters, nearer boxes first.
+#[inline(always)]
+pub(super) fn visit<K: BoxKernel>(
+    view: &View<'_>,
+    ray: &Ray,
+    stack: &mut Stack,
+    meet: impl FnMut(Item) -> Step,
+) {
+    visit_nodes::<K>(view, ray, stack, || (), meet);
+}
+
+/// The same, and calls `enter` for each node.
+#[inline(always)]
+pub(super) fn visit_nodes<K: BoxKernel>(
+    view: &View<'_>,
+    ray: &Ray,
+    Stack(stack): &mut Stack,
+    mut enter: impl FnMut(),
+    mut meet: impl FnMut(Item) -> Step,
+) {
+    let mut box_ray = BoxRay::new(ray.origin, ray.direction, ray.reach, &view.header.frame);
+    let mut waiting = 0;
+    let mut current = Child(0); // The root.
+    loop {
+        if current.is_leaf() {
+            for &item in &view.items[current.items()] {
+                match meet(item) {
+                    Step::On(reach) => box_ray.shorten(reach),
+                    Step::Enough => return,
+                }
+            }
+        } else {
+            enter();
+            let node = &view.nodes[current.node()];
+            let (distances, mut mask) = K::test(node, &box_ray);
+            let first = waiting;
+            while mask != 0 {
+                let child = mask.trailing_zeros() as usize & 7;
+                mask &= mask - 1;
+                // Insert so that the nearest ends on top.
+                let mut at = waiting;
+                while at > first && stack[at - 1].0 < distances[child] {
+                    stack[at] = stack[at - 1];
+                    at -= 1;
+                }
+                stack[at] = (distances[child], node.children[child]);
+                waiting += 1;
+            }
+        }
+        current = loop {
+            if waiting == 0 {
+                return;
+            }
+            waiting -= 1;
+            let (near, child) = stack[waiting];
+            if box_ray.reaches(near) {
+                break child;
+            }
+        };
+    }
+}
