@@ -58,5 +58,5 @@ mod triangle;
 mod wavefront;
 
 #[cfg(test)]
-#[path = "../tests/long/mod.rs"]
+#[path = "../tests/it/support/long.rs"]
 mod long;

@@ -1,13 +1,7 @@
 //! Numbers that are hard: shapes that are tiny, huge, far away, thin or grazed, and rays with
 //! zeros, NaNs and numbers next to zero. Each case tells what it measured.
 
-mod judge;
-mod long;
-mod studio;
-
 use glam::DVec3;
-use judge::check_against_oracle;
-use long::{few_rays, random, rays, tell};
 use rayon::prelude::*;
 use rtfarm_core::{
     isa::Isa,
@@ -24,7 +18,12 @@ use rtfarm_oracle::{
     random::Random,
     random_scene::{Aim, Recipe, Style, random_ray, random_scene},
 };
-use studio::{picture, pixels, quality, read, settings, whole};
+
+use crate::support::{
+    judge::check_against_oracle,
+    long::{few_rays, random, rays, tell},
+    studio::{picture, pixels, quality, read, settings, whole},
+};
 
 type Block = PreparedScene<PreparedBytes>;
 

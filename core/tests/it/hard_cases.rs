@@ -2,15 +2,9 @@
 
 #![expect(clippy::float_cmp, reason = "what holds exactly is tested exactly")]
 
-mod long;
-mod parts;
-mod studio;
-
 use std::fmt::Write;
 
 use glam::DVec3;
-use long::{random, rays, tell};
-use parts::{join, sphere, upright};
 use rtfarm_core::{
     isa::Isa,
     prepared::{PreparedBytes, PreparedScene},
@@ -18,7 +12,12 @@ use rtfarm_core::{
     trace::Probe,
 };
 use rtfarm_oracle::{Oracle, closed_forms::irradiance, eye_direction, random::Random};
-use studio::{picture, pixels, prepared, read, settings};
+
+use crate::support::{
+    long::{random, rays, tell},
+    parts::{join, sphere, upright},
+    studio::{picture, pixels, prepared, read, settings},
+};
 
 const BLACK: [f32; 3] = [0.0; 3];
 

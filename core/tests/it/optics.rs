@@ -2,15 +2,9 @@
 
 #![expect(clippy::float_cmp, reason = "what holds exactly is tested exactly")]
 
-mod long;
-mod parts;
-mod studio;
-
 use std::{fmt::Write, ops::ControlFlow, sync::Arc};
 
 use glam::DVec3;
-use long::{few_rays, random, rays, tell};
-use parts::{join, sphere, upright};
 use rtfarm_core::{
     isa::Isa,
     render::{RenderedTile, render_tile},
@@ -19,7 +13,12 @@ use rtfarm_core::{
 use rtfarm_oracle::{
     Settings as OracleSettings, closed_forms::irradiance, eye_direction, reference_picture,
 };
-use studio::{picture, pixels, prepared, read, settings, whole};
+
+use crate::support::{
+    long::{few_rays, random, rays, tell},
+    parts::{join, sphere, upright},
+    studio::{picture, pixels, prepared, read, settings, whole},
+};
 
 /// A screen of 2 x 2 at z = 2.5, seen from z = 5.
 const VIEWPORT: &str = "viewport origin 0 0 5 topleft -1 1 2.5 bottomleft -1 -1 2.5

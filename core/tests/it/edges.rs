@@ -1,10 +1,7 @@
 //! Closed surfaces let no ray through at their edges and corners, wherever they stand and however
 //! large they are.
 
-mod long;
-
 use glam::DVec3;
-use long::{few_rays, random, rays, tell};
 use rayon::prelude::*;
 use rtfarm_core::{
     isa::Isa,
@@ -18,6 +15,8 @@ use rtfarm_oracle::{
     random::Random,
     random_scene::{Recipe, Style, random_scene},
 };
+
+use crate::support::long::{few_rays, random, rays, tell};
 
 /// Where surfaces stand and how large they are.
 const PLACES: [(f64, f64); 6] = [

@@ -1,14 +1,10 @@
 //! Image files of all formats against the texels that they give, and textured faces against what
 //! is to be seen of them.
 
-mod long;
-mod studio;
-
 use std::{fs, io::Cursor, ops::ControlFlow, path::Path};
 
 use glam::DVec2;
 use image::{DynamicImage, ImageFormat, RgbImage, RgbaImage};
-use long::tell;
 use rtfarm_core::{
     isa::Isa,
     read::read_scene,
@@ -25,7 +21,11 @@ use rtfarm_oracle::{
     random_scene::{Recipe, Style, random_scene},
     reference_picture,
 };
-use studio::{picture, pixels, prepared, quality, settings, whole};
+
+use crate::support::{
+    long::tell,
+    studio::{self, picture, pixels, prepared, quality, settings, whole},
+};
 
 const TEXELS: [[u8; 3]; 6] =
     [[255, 0, 0], [0, 255, 0], [0, 0, 255], [1, 2, 3], [128, 64, 32], [250, 251, 252]];

@@ -1,13 +1,9 @@
 //! Whole pictures: the tracer's against the oracle's, against closed forms, against its own when
 //! the picture is cut, the scene scaled, moved or turned.
 
-mod long;
-mod studio;
-
 use std::{fs, path::Path};
 
 use glam::{DVec2, DVec3};
-use long::tell;
 use rtfarm_core::{
     prepared::{PreparedBytes, PreparedScene},
     read::read_scene,
@@ -24,7 +20,11 @@ use rtfarm_oracle::{
     random_scene::{Recipe, Style, random_scene},
     reference_picture,
 };
-use studio::{picture, pixels, prepared, quality, read, settings, whole};
+
+use crate::support::{
+    long::tell,
+    studio::{picture, pixels, prepared, quality, read, settings, whole},
+};
 
 /// The channels are rounded to f32 once, at the end; 1.0 is what a scene writes as 255.
 const ROUNDING: f64 = 1e-6;

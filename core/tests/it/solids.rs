@@ -2,16 +2,9 @@
 //!
 //! `RTFARM_RAYS=100` takes a hundred times as many rays.
 
-mod judge;
-mod long;
-mod parts;
-
 use std::{f64::consts::PI, thread};
 
 use glam::{DMat3, DVec3};
-use judge::check_against_oracle;
-use long::{few_rays, random, rays, tell};
-use parts::{join, parallelepiped, sphere, upright};
 use rayon::prelude::*;
 use rtfarm_core::{
     isa::Isa,
@@ -25,6 +18,12 @@ use rtfarm_oracle::{
     Oracle,
     random::Random,
     random_scene::{Recipe, Style, random_scene},
+};
+
+use crate::support::{
+    judge::check_against_oracle,
+    long::{few_rays, random, rays, tell},
+    parts::{join, parallelepiped, sphere, upright},
 };
 
 /// Rays in a batch.
