@@ -56,7 +56,3 @@ pub mod tile;
 pub mod trace;
 mod triangle;
 mod wavefront;
-
-#[cfg(test)]
-#[path = "../tests/it/support/long.rs"]
-mod long;
