@@ -5,8 +5,9 @@ use std::sync::Arc;
 use glam::{DVec2, DVec3};
 
 use super::{
-    block::{Block, Field},
+    block::Block,
     diagnostic::shown,
+    field::Field,
     lexer::Word,
     reader::{Reader, plain},
 };
@@ -28,7 +29,7 @@ struct OpenOperation<'t> {
 impl<'t> Reader<'t> {
     /// Reads the shapes. Operations may be nested a million deep: those that are open form a
     /// list, not calls.
-    pub(crate) fn read_geometry(&mut self, opening: Word<'t>) {
+    pub(super) fn read_geometry(&mut self, opening: Word<'t>) {
         self.blocks.enter(Block::Geometry, opening);
         let mut operations: Vec<OpenOperation<'t>> = Vec::new();
         let mut nodes: Vec<SolidNode> = Vec::new();
@@ -426,7 +427,7 @@ fn operation(block: Block) -> Option<Operation> {
 }
 
 /// A vector of length 1 along `vector`, however long that is.
-pub(crate) fn direction(vector: DVec3) -> DVec3 {
+pub(super) fn direction(vector: DVec3) -> DVec3 {
     let scaled = vector / vector.abs().max_element();
     scaled / scaled.length()
 }

@@ -10,27 +10,27 @@ use crate::text::{
 
 /// Walks over the words of a scene text.
 #[derive(Debug, Clone)]
-pub(crate) struct Lexer<'t> {
+pub(super) struct Lexer<'t> {
     text: &'t [u8],
     at: usize,
 }
 
 /// A word of the text and where it stands.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) struct Word<'t> {
+pub(super) struct Word<'t> {
     /// The word, without its quotes.
-    pub(crate) bytes: &'t [u8],
+    pub(super) bytes: &'t [u8],
     /// Byte offset of its beginning, the opening quote included.
-    pub(crate) start: usize,
+    pub(super) start: usize,
     /// Byte offset behind it, the closing quote included.
-    pub(crate) end: usize,
+    pub(super) end: usize,
     /// How it is written.
-    pub(crate) quotes: Quotes,
+    pub(super) quotes: Quotes,
 }
 
 /// The quotes around a word.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Quotes {
+pub(super) enum Quotes {
     /// None.
     Bare,
     /// One on either side.
@@ -41,12 +41,12 @@ pub(crate) enum Quotes {
 
 impl Word<'_> {
     /// Where the word stands, in bytes.
-    pub(crate) fn span(&self) -> Range<usize> {
+    pub(super) fn span(&self) -> Range<usize> {
         self.start..self.end
     }
 
     /// Whether it can only be meant as a number: it begins with a digit, a sign or a point.
-    pub(crate) fn is_number_like(&self) -> bool {
+    pub(super) fn is_number_like(&self) -> bool {
         let digits = unsigned(self.bytes);
         let is_signed = digits.len() < self.bytes.len();
         self.quotes == Quotes::Bare
@@ -57,12 +57,12 @@ impl Word<'_> {
     }
 
     /// Whether it is `…` or `...`, which people leave where a list goes on.
-    pub(crate) fn is_ellipsis(&self) -> bool {
+    pub(super) fn is_ellipsis(&self) -> bool {
         self.quotes == Quotes::Bare && matches!(self.bytes, b"..." | b"\xe2\x80\xa6")
     }
 
     /// The word as a finite or infinite number; `None` when it is none or NaN.
-    pub(crate) fn number(&self) -> Option<f64> {
+    pub(super) fn number(&self) -> Option<f64> {
         if self.quotes != Quotes::Bare || self.is_named_infinity_or_nan() {
             return None;
         }
@@ -70,7 +70,7 @@ impl Word<'_> {
     }
 
     /// Whether it spells NaN or infinity.
-    pub(crate) fn is_named_infinity_or_nan(&self) -> bool {
+    pub(super) fn is_named_infinity_or_nan(&self) -> bool {
         is_infinity_or_nan(unsigned(self.bytes))
     }
 }
@@ -86,27 +86,27 @@ fn is_infinity_or_nan(unsigned: &[u8]) -> bool {
 
 impl<'t> Lexer<'t> {
     /// Starts at byte `at` of `text`.
-    pub(crate) fn new(text: &'t [u8], at: usize) -> Self {
+    pub(super) fn new(text: &'t [u8], at: usize) -> Self {
         Self { text, at }
     }
 
     /// The whole text.
-    pub(crate) fn text(&self) -> &'t [u8] {
+    pub(super) fn text(&self) -> &'t [u8] {
         self.text
     }
 
     /// The byte that is looked at next.
-    pub(crate) fn at(&self) -> usize {
+    pub(super) fn at(&self) -> usize {
         self.at
     }
 
     /// Goes on from byte `at`.
-    pub(crate) fn go_to(&mut self, at: usize) {
+    pub(super) fn go_to(&mut self, at: usize) {
         self.at = at;
     }
 
     /// Reads one word.
-    pub(crate) fn next(&mut self) -> Option<Word<'t>> {
+    pub(super) fn next(&mut self) -> Option<Word<'t>> {
         self.skip_space();
         let start = self.at;
         let first = *self.text.get(start)?;
@@ -128,18 +128,18 @@ impl<'t> Lexer<'t> {
     }
 
     /// The word that [`Lexer::next`] would read.
-    pub(crate) fn peek(&self) -> Option<Word<'t>> {
+    pub(super) fn peek(&self) -> Option<Word<'t>> {
         self.clone().next()
     }
 
     /// Goes to the end of the line.
-    pub(crate) fn skip_line(&mut self) {
+    pub(super) fn skip_line(&mut self) {
         let rest = &self.text[self.at..];
         self.at += memchr::memchr(b'\n', rest).unwrap_or(rest.len());
     }
 
     /// Goes over white space and comments.
-    pub(crate) fn skip_space(&mut self) {
+    pub(super) fn skip_space(&mut self) {
         while let Some(&byte) = self.text.get(self.at) {
             match class(byte) {
                 Class::Space => self.at += 1,

@@ -2,8 +2,13 @@
 
 mod block;
 mod diagnostic;
+mod drawing;
+mod field;
 mod geometry;
-pub(crate) mod lexer;
+mod lexer;
+mod pieces;
 pub mod reader;
+mod suggestion;
 mod symbol;
 mod triangles;
+mod walk;

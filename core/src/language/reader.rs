@@ -10,12 +10,16 @@ use std::{collections::HashMap, io, sync::Arc};
 use glam::DVec3;
 
 use super::{
-    block::{Block, Blocks, Field, suggestion},
+    block::Block,
     diagnostic::{Places, Report, shown},
+    field::Field,
     geometry::direction,
     lexer::Word,
+    pieces,
+    suggestion::suggestion,
     symbol::Symbols,
-    triangles::{self, Triangles},
+    triangles::Triangles,
+    walk::Blocks,
 };
 use crate::{
     assets::{
@@ -28,7 +32,10 @@ use crate::{
     transfer::Transfer,
 };
 
-pub use super::diagnostic::{Diagnostic, Omitted, Related, Severity, Style, draw_diagnostics};
+pub use super::{
+    diagnostic::{Diagnostic, Omitted, Related, Severity},
+    drawing::{Style, draw_diagnostics},
+};
 
 /// Reads the bytes of a file that a scene names; the path is as the scene has it.
 pub type Resolve<'a> = dyn Fn(&str) -> io::Result<Vec<u8>> + Sync + 'a;
@@ -78,7 +85,7 @@ pub fn read_scene(text: &[u8], resolve: &Resolve<'_>) -> Reading {
 /// Reads a scene whose colours are encoded: those of materials, textures, point lights and the
 /// background. `ambient` is an amount of light.
 pub fn read_scene_with(text: &[u8], resolve: &Resolve<'_>, transfer: Transfer) -> Reading {
-    read_scene_in_pieces(text, resolve, transfer, triangles::PIECE)
+    read_scene_in_pieces(text, resolve, transfer, pieces::PIECE)
 }
 
 /// Reads a scene whose triangles are parsed in parallel by pieces of about so many bytes.
@@ -100,17 +107,17 @@ pub(crate) fn read_scene_in_pieces(
 }
 
 /// What has been read so far.
-pub(crate) struct Reader<'t> {
-    pub(crate) text: &'t [u8],
+pub(super) struct Reader<'t> {
+    pub(super) text: &'t [u8],
     /// Whether it is worth reading.
     is_text: bool,
-    pub(crate) piece: usize,
-    pub(crate) blocks: Blocks<'t>,
-    pub(crate) symbols: Symbols<'t>,
-    pub(crate) triangles: Triangles,
-    pub(crate) scene: Scene,
+    pub(super) piece: usize,
+    pub(super) blocks: Blocks<'t>,
+    pub(super) symbols: Symbols<'t>,
+    pub(super) triangles: Triangles,
+    pub(super) scene: Scene,
     /// The next primitive's number.
-    pub(crate) primitive: u64,
+    pub(super) primitive: u64,
     viewport: Option<Word<'t>>,
     width: Field<'t, u32>,
     height: Field<'t, u32>,
@@ -122,7 +129,7 @@ pub(crate) struct Reader<'t> {
     /// The file name of each material's texture.
     texture_names: Vec<(u32, Word<'t>)>,
     /// What each mesh's file is called.
-    pub(crate) mesh_files: Vec<Word<'t>>,
+    pub(super) mesh_files: Vec<Word<'t>>,
 }
 
 /// A point light before the reference that governs it is known.
@@ -160,7 +167,7 @@ impl<'t> Reader<'t> {
         }
     }
 
-    pub(crate) fn report(&mut self) -> &mut Report {
+    pub(super) fn report(&mut self) -> &mut Report {
         &mut self.blocks.report
     }
 
@@ -283,7 +290,7 @@ impl<'t> Reader<'t> {
     }
 
     /// Reports that the value that was read last cannot be used.
-    pub(crate) fn refuse_value(&mut self, message: impl FnOnce() -> String) {
+    pub(super) fn refuse_value(&mut self, message: impl FnOnce() -> String) {
         let span = self.blocks.value_span();
         self.report().error(span, message);
     }
@@ -317,7 +324,7 @@ impl<'t> Reader<'t> {
         DVec3::from(color.to_array().map(|number| self.scene.transfer.decode(number)))
     }
 
-    pub(crate) fn warn_synonym(&mut self, word: Word<'t>, instead: &str) {
+    pub(super) fn warn_synonym(&mut self, word: Word<'t>, instead: &str) {
         self.report().warn(word.span(), || format!("{} is read as {instead}", shown(word.bytes)));
     }
 
@@ -453,14 +460,14 @@ impl<'t> Reader<'t> {
         (value >= 0.0).then_some(value)
     }
 
-    pub(crate) fn above_zero(&mut self, word: Word<'t>, value: f64) -> Option<f64> {
+    pub(super) fn above_zero(&mut self, word: Word<'t>, value: f64) -> Option<f64> {
         if value <= 0.0 {
             self.refuse_value(|| format!("{} must be above 0, but is {value}", shown(word.bytes)));
         }
         (value > 0.0).then_some(value)
     }
 
-    pub(crate) fn file_name(&mut self, word: Word<'t>) -> Option<Word<'t>> {
+    pub(super) fn file_name(&mut self, word: Word<'t>) -> Option<Word<'t>> {
         let name = self.blocks.value_word(word, "a file name")?;
         self.blocks.ends_file_name(name).then_some(name)
     }
@@ -563,7 +570,7 @@ impl<'t> Reader<'t> {
         }
     }
 
-    pub(crate) fn read_coords(&mut self, word: Word<'t>, coords: &mut Field<'t, DVec3>) {
+    pub(super) fn read_coords(&mut self, word: Word<'t>, coords: &mut Field<'t, DVec3>) {
         if word.bytes == b"position" {
             self.warn_synonym(word, "`coords`");
         }
@@ -734,7 +741,7 @@ impl<'t> Reader<'t> {
 }
 
 /// A keyword in a sentence.
-pub(crate) fn plain(word: Word<'_>) -> String {
+pub(super) fn plain(word: Word<'_>) -> String {
     String::from_utf8_lossy(word.bytes).into_owned()
 }
 

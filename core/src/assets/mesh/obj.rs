@@ -1,14 +1,17 @@
 //! OBJ files: vertices and polygons; all else is skipped. Source: Wavefront, "Object Files
 //! (.obj)", Advanced Visualizer manual, appendix B1.
 
-use super::{MeshBuilder, MeshError, MeshFault, MeshFile};
+use super::{
+    builder::{MeshBuilder, MeshFile},
+    error::{MeshError, MeshFault},
+};
 use crate::text::{
     bytes::{Class, class},
     number::scan_number,
 };
 
 /// Reads a file.
-pub(crate) fn read_obj(text: &[u8]) -> Result<MeshFile, MeshError> {
+pub(super) fn read_obj(text: &[u8]) -> Result<MeshFile, MeshError> {
     let mut mesh = MeshBuilder::<f64>::with_capacity(0, 0);
     // The file's vertices by their numbers less one.
     let mut vertices: Vec<u32> = Vec::new();

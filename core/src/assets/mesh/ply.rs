@@ -1,19 +1,22 @@
 //! PLY files, ASCII and binary in both byte orders: the vertices' x, y, z and the faces' lists of
 //! vertices; all else is skipped. Source: Turk, "The PLY Polygon File Format" (1994).
 
-use super::{MeshBuilder, MeshError, MeshFault, MeshFile, MeshPlace};
+use super::{
+    builder::{MeshBuilder, MeshFile},
+    error::{MeshError, MeshFault, MeshPlace},
+};
 use crate::text::{
     bytes::{Class, class},
     number::scan_number,
 };
 
 /// Whether bytes begin as a PLY file does.
-pub(crate) fn is_ply(bytes: &[u8]) -> bool {
+pub(super) fn is_ply(bytes: &[u8]) -> bool {
     bytes.starts_with(b"ply\n") || bytes.starts_with(b"ply\r")
 }
 
 /// Reads a file.
-pub(crate) fn read_ply(bytes: &[u8]) -> Result<MeshFile, MeshError> {
+pub(super) fn read_ply(bytes: &[u8]) -> Result<MeshFile, MeshError> {
     let header = Header::read(bytes)?;
     let vertex = header.element("vertex").ok_or(MeshFault::Missing("vertices").of_file())?;
     if vertex.count > u64::from(u32::MAX) {

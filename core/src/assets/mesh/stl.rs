@@ -1,6 +1,9 @@
 //! STL files. Source: 3D Systems, "Stereo Lithography Interface Specification" (1989).
 
-use super::{MeshBuilder, MeshError, MeshFault, MeshFile, MeshPlace};
+use super::{
+    builder::{MeshBuilder, MeshFile},
+    error::{MeshError, MeshFault, MeshPlace},
+};
 use crate::text::{
     bytes::{Class, class},
     number::scan_number,
@@ -13,12 +16,12 @@ const HEADER: usize = 84;
 const FACET: usize = 50;
 
 /// Whether bytes look like STL.
-pub(crate) fn is_stl(bytes: &[u8]) -> bool {
+pub(super) fn is_stl(bytes: &[u8]) -> bool {
     binary_length(bytes) == Some(bytes.len() as u64) || starts_as_text(bytes)
 }
 
 /// Reads a binary or ASCII file. Binary ones may begin with `solid` too, so their length decides.
-pub(crate) fn read_stl(bytes: &[u8]) -> Result<MeshFile, MeshError> {
+pub(super) fn read_stl(bytes: &[u8]) -> Result<MeshFile, MeshError> {
     let binary_length = binary_length(bytes);
     let head = &bytes[..bytes.len().min(1024)];
     let is_text = starts_as_text(bytes)

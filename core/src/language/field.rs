@@ -1,0 +1,208 @@
+//! The fields of blocks: their values, and what is said of those that cannot be used.
+
+use std::ops::Range;
+
+use super::{
+    block::{Block, is_keyword},
+    diagnostic::{Report, shown},
+    lexer::{Quotes, Word},
+    walk::Blocks,
+};
+
+/// A field of a block: unset, set, or set to something that was reported.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Field<'t, T> {
+    /// The keyword, once it was seen.
+    pub(super) word: Option<Word<'t>>,
+    /// Its value, if that is sound.
+    pub(super) value: Option<T>,
+}
+
+impl<T> Default for Field<'_, T> {
+    fn default() -> Self {
+        Self { word: None, value: None }
+    }
+}
+
+impl<'t, T> Field<'t, T> {
+    /// Takes a value; the last one wins, with a warning.
+    pub(super) fn set(&mut self, report: &mut Report, word: Word<'t>, value: Option<T>) {
+        if let Some(earlier) = self.word.replace(word) {
+            report.warn_with(
+                word.span(),
+                || format!("{} stands here again; this one counts", shown(word.bytes)),
+                || Some((earlier.span(), "the earlier one".into())),
+            );
+        }
+        self.value = value;
+    }
+
+    /// The value; it is an error when the field was never set, unless the text is cut off.
+    pub(super) fn require(
+        self,
+        blocks: &mut Blocks<'t>,
+        block: Word<'t>,
+        field: &str,
+    ) -> Option<T> {
+        if self.word.is_none() && !blocks.is_cut {
+            blocks
+                .report
+                .error(block.span(), || format!("this {} has no `{field}`", shown(block.bytes)));
+        }
+        self.value
+    }
+}
+
+impl<'t> Blocks<'t> {
+    /// Reads the `N` numbers of a field; `None` when that failed and was reported.
+    pub(super) fn numbers<const N: usize>(&mut self, field: Word<'t>) -> Option<[f64; N]> {
+        self.last_field = Some((field, N));
+        let mut numbers = [0.0; N];
+        let mut is_sound = true;
+        let mut end = field.end;
+        self.value_span = field.span();
+        for (count, number) in numbers.iter_mut().enumerate() {
+            let Some(word) = self.lexer.peek().filter(|word| self.is_value(word, end)) else {
+                if is_sound {
+                    self.report_missing_numbers(field, end, count, N);
+                }
+                return None;
+            };
+            self.lexer.go_to(word.end);
+            end = word.end;
+            self.value_span = if count == 0 { word.start } else { self.value_span.start }..end;
+            match word.number() {
+                Some(value) if value.is_finite() => *number = value,
+                _ if is_sound => {
+                    is_sound = false;
+                    self.report_bad_number(&word, N);
+                }
+                _ => {}
+            }
+        }
+        is_sound.then_some(numbers)
+    }
+
+    /// Reads one number.
+    pub(super) fn number(&mut self, field: Word<'t>) -> Option<f64> {
+        self.numbers::<1>(field).map(|[number]| number)
+    }
+
+    /// How many of the next two words can only be numbers.
+    pub(super) fn numbers_that_follow(&self) -> usize {
+        let mut ahead = self.lexer.clone();
+        std::iter::from_fn(|| ahead.next()).take(2).take_while(Word::is_number_like).count()
+    }
+
+    /// Where the numbers stand that were read last.
+    pub(super) fn value_span(&self) -> Range<usize> {
+        self.value_span.clone()
+    }
+
+    /// Whether a word behind byte `end` is meant as a value: anything on the same line but a
+    /// keyword, and on later lines what looks like a number.
+    fn is_value(&self, word: &Word<'t>, end: usize) -> bool {
+        word.is_number_like() || (self.is_on_one_line(end..word.start) && !is_keyword(word))
+    }
+
+    fn report_missing_numbers(&mut self, field: Word<'t>, end: usize, count: usize, needed: usize) {
+        self.report.error(field.start..end, || {
+            let numbers =
+                if needed == 1 { "one number".into() } else { format!("{needed} numbers") };
+            let found = match count {
+                0 => "none".into(),
+                _ => format!("only {count}"),
+            };
+            format!(
+                "{} takes {numbers}, but {found} {} here",
+                shown(field.bytes),
+                if count > 1 { "stand" } else { "stands" }
+            )
+        });
+    }
+
+    fn report_bad_number(&mut self, word: &Word<'t>, needed: usize) {
+        let field = self.last_field.map_or(*word, |(field, _)| field);
+        self.report.error(word.span(), || {
+            let shown = shown(word.bytes);
+            if word.is_named_infinity_or_nan() {
+                return format!(
+                    "{shown} cannot be computed with; a finite number should stand here"
+                );
+            }
+            if word.number().is_some() {
+                return format!("{shown} is too large: numbers go up to about 1.8e308");
+            }
+            let with_points: Vec<u8> =
+                word.bytes.iter().map(|&byte| if byte == b',' { b'.' } else { byte }).collect();
+            let pointed = Word { bytes: &with_points, ..*word };
+            if let Some(number) = word.bytes.strip_suffix(b",")
+                && (Word { bytes: number, ..*word }).number().is_some()
+            {
+                return format!(
+                    "{shown} is no number: spaces alone stand between numbers, no commas"
+                );
+            }
+            if pointed.number().is_some() {
+                let right = String::from_utf8_lossy(&with_points).into_owned();
+                return format!(
+                    "{shown} is no number: the decimal sign is a point, as in `{right}`"
+                );
+            }
+            let numbers =
+                if needed == 1 { "one number".into() } else { format!("{needed} numbers") };
+            format!(
+                "{shown} is no number; {} takes {numbers}",
+                crate::language::diagnostic::shown(field.bytes)
+            )
+        });
+    }
+
+    /// Reads the one word of a field, a `what`; `None` when that failed and was reported.
+    pub(super) fn value_word(&mut self, field: Word<'t>, what: &str) -> Option<Word<'t>> {
+        self.last_field = Some((field, 0));
+        let is_missing = |word: &Word<'t>| {
+            Block::ended_by(word).is_some()
+                || (is_keyword(word) && !self.is_on_one_line(field.end..word.start))
+        };
+        let Some(word) = self.lexer.peek().filter(|word| !is_missing(word)) else {
+            self.report.error(field.span(), || {
+                format!("{} takes {what}, but none stands here", shown(field.bytes))
+            });
+            return None;
+        };
+        self.lexer.go_to(word.end);
+        match word.quotes {
+            Quotes::Open => {
+                self.report.error(word.span(), || "this quote is not closed on its line".into());
+                None
+            }
+            Quotes::Closed if word.bytes.is_empty() => {
+                self.report.error(word.span(), || {
+                    format!("{} takes {what}, not nothing", shown(field.bytes))
+                });
+                None
+            }
+            _ => Some(word),
+        }
+    }
+
+    /// Whether a file name is all that stands on its line; if not, it wants quotes, and that is
+    /// reported.
+    pub(super) fn ends_file_name(&mut self, name: Word<'t>) -> bool {
+        let is_continued = name.quotes == Quotes::Bare
+            && self.lexer.peek().is_some_and(|next| {
+                self.is_on_one_line(name.end..next.start)
+                    && !is_keyword(&next)
+                    && !next.is_ellipsis()
+            });
+        if is_continued {
+            self.skip_line();
+            let end = self.lexer.at();
+            self.report.error(name.start..end, || {
+                "a file name with spaces stands in double quotes".into()
+            });
+        }
+        !is_continued
+    }
+}
