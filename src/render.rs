@@ -12,8 +12,8 @@ use std::{
 use anyhow::{Context, anyhow};
 use rtfarm_coordinator::{Config, Coordinator, End, Job, Listener, Order, Progress, Refusal};
 use rtfarm_core::{
+    language::draw_diagnostics,
     picture::Picture,
-    read::draw_diagnostics,
     render::{Sampling, Tally},
     tile::Size,
     transfer::Transfer,

@@ -22,9 +22,9 @@ use std::{
 use anyhow::{Context, anyhow};
 use rtfarm_core::{
     isa::Isa,
+    language::{draw_diagnostics, read_scene},
     prepare::prepare,
     prepared::{PreparedBytes, PreparedScene},
-    read::{draw_diagnostics, read_scene},
     render::{Quality, Sampling, Settings, render_tile},
     tile::{Area, Size},
 };

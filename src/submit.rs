@@ -11,7 +11,7 @@ use std::{
 
 use anyhow::{Context, anyhow};
 use rtfarm_coordinator::{Progress, Wish};
-use rtfarm_core::{read::read_scene, tile::Size};
+use rtfarm_core::{language::read_scene, tile::Size};
 use rtfarm_proto::{
     CHUNK_BYTES, MESSAGE_BYTES, PROTOCOL,
     wire::{self, event, jobs_client::JobsClient, submit_request::Part, submit_response::Outcome},

@@ -1,10 +1,10 @@
 //! An order: from a scene's text to what a job needs.
 
 use rtfarm_core::{
+    language::{Diagnostic, Omitted, Reading, Resolve, read_scene_with},
     picture::PictureFormat,
     prepare::{PrepareError, prepare},
     prepared::PreparedBytes,
-    read::{Diagnostic, Omitted, Reading, Resolve, read_scene_with},
     render::{Quality, Settings},
     scene::Scene,
     tile::{Size, TileGrid},

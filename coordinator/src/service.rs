@@ -9,8 +9,8 @@ use std::{
 };
 
 use rtfarm_core::{
+    language::{Style, draw_diagnostics},
     picture::{PutError, check_pixels},
-    read::{Style, draw_diagnostics},
     render::Tally,
     tile::{Size, TileId},
 };

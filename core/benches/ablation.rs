@@ -22,10 +22,10 @@ use std::{
 
 use rtfarm_core::{
     isa::Isa,
+    language::read_scene,
     left_out::{self, BUILT_WITHOUT},
     prepare::prepare,
     prepared::{PreparedBytes, PreparedScene},
-    read::read_scene,
     render::{Quality, Sampling, Settings, render_tile},
     tile::{Area, Size},
 };

@@ -15,9 +15,9 @@ use std::{env, fs, ops::ControlFlow, path::Path, time::Instant};
 
 use rtfarm_core::{
     isa::Isa,
+    language::read_scene,
     prepare::{prepare, prepare_unaimed},
     prepared::{PreparedBytes, PreparedScene},
-    read::read_scene,
     render::{Quality, RenderedTile, Sampling, Settings, render_tile},
     tile::{Area, Size},
 };

@@ -27,6 +27,3 @@ pub mod picture;
 pub mod render;
 mod shade;
 pub mod trace;
-
-pub use assets::{mesh as mesh_file, texture};
-pub use language::reader as read;

@@ -1,5 +1,5 @@
 //! A scene as its author wrote it, checked: every number is finite, every reference resolves,
-//! every shape has the extent that its type promises. Only [`crate::read`] makes one from text;
+//! every shape has the extent that its type promises. Only [`crate::language`] makes one from text;
 //! whoever makes one by hand keeps the invariants written at each field.
 
 use std::{fmt, sync::Arc};

@@ -1,13 +1,14 @@
 //! The fields of blocks: their values, and what is said of those that cannot be used.
 
-use std::ops::Range;
+use glam::DVec3;
 
 use super::{
     block::{Block, is_keyword},
     diagnostic::{Report, shown},
     lexer::{Quotes, Word},
-    walk::Blocks,
+    walk::Walk,
 };
+use crate::transfer::Transfer;
 
 /// A field of a block: unset, set, or set to something that was reported.
 #[derive(Debug, Clone, Copy)]
@@ -38,22 +39,16 @@ impl<'t, T> Field<'t, T> {
     }
 
     /// The value; it is an error when the field was never set, unless the text is cut off.
-    pub(super) fn require(
-        self,
-        blocks: &mut Blocks<'t>,
-        block: Word<'t>,
-        field: &str,
-    ) -> Option<T> {
-        if self.word.is_none() && !blocks.is_cut {
-            blocks
-                .report
+    pub(super) fn require(self, walk: &mut Walk<'t>, block: Word<'t>, field: &str) -> Option<T> {
+        if self.word.is_none() && !walk.is_cut {
+            walk.report
                 .error(block.span(), || format!("this {} has no `{field}`", shown(block.bytes)));
         }
         self.value
     }
 }
 
-impl<'t> Blocks<'t> {
+impl<'t> Walk<'t> {
     /// Reads the `N` numbers of a field; `None` when that failed and was reported.
     pub(super) fn numbers<const N: usize>(&mut self, field: Word<'t>) -> Option<[f64; N]> {
         self.last_field = Some((field, N));
@@ -92,11 +87,6 @@ impl<'t> Blocks<'t> {
     pub(super) fn numbers_that_follow(&self) -> usize {
         let mut ahead = self.lexer.clone();
         std::iter::from_fn(|| ahead.next()).take(2).take_while(Word::is_number_like).count()
-    }
-
-    /// Where the numbers stand that were read last.
-    pub(super) fn value_span(&self) -> Range<usize> {
-        self.value_span.clone()
     }
 
     /// Whether a word behind byte `end` is meant as a value: anything on the same line but a
@@ -205,4 +195,88 @@ impl<'t> Blocks<'t> {
         }
         !is_continued
     }
+
+    /// Reads the name of a file.
+    pub(super) fn file_name(&mut self, field: Word<'t>) -> Option<Word<'t>> {
+        let name = self.value_word(field, "a file name")?;
+        self.ends_file_name(name).then_some(name)
+    }
+
+    /// Reads a number that must be above 0.
+    pub(super) fn number_above_zero(&mut self, field: Word<'t>) -> Option<f64> {
+        let value = self.number(field)?;
+        if value <= 0.0 {
+            self.refuse_value(|| format!("{} must be above 0, but is {value}", shown(field.bytes)));
+        }
+        (value > 0.0).then_some(value)
+    }
+
+    /// Reads a number that must be 0 or more.
+    pub(super) fn number_from_zero(&mut self, field: Word<'t>) -> Option<f64> {
+        let value = self.number(field)?;
+        if value < 0.0 {
+            self.refuse_value(|| {
+                format!("{} must be 0 or more, but is {value}", shown(field.bytes))
+            });
+        }
+        (value >= 0.0).then_some(value)
+    }
+
+    /// Reads a position.
+    pub(super) fn position(&mut self, field: Word<'t>) -> Option<DVec3> {
+        self.numbers(field).map(DVec3::from)
+    }
+
+    /// Reads a `coords` field or its synonym into `coords`.
+    pub(super) fn read_coords(&mut self, field: Word<'t>, coords: &mut Field<'t, DVec3>) {
+        if field.bytes == b"position" {
+            self.warn_synonym(field, "`coords`");
+        }
+        let value = self.position(field);
+        coords.set(&mut self.report, field, value);
+    }
+
+    /// Reads a colour where 255 is 1, that may be brighter but not negative.
+    pub(super) fn color(&mut self, field: Word<'t>) -> Option<DVec3> {
+        let color = self.position(field)?;
+        let is_color = color.min_element() >= 0.0;
+        if !is_color {
+            self.refuse_value(|| {
+                format!(
+                    "the parts of a colour must be 0 or more, but one is {}",
+                    color.min_element()
+                )
+            });
+        }
+        is_color.then_some(color / 255.0)
+    }
+
+    /// Reads such a colour that is encoded by `transfer`, as light.
+    pub(super) fn light(&mut self, field: Word<'t>, transfer: Transfer) -> Option<DVec3> {
+        let light = decode(self.color(field)?, transfer);
+        if !light.is_finite() {
+            self.refuse_value(|| "this colour is too bright to be computed with".into());
+        }
+        light.is_finite().then_some(light)
+    }
+
+    /// Reports that the value that was read last cannot be used.
+    pub(super) fn refuse_value(&mut self, message: impl FnOnce() -> String) {
+        self.report.error(self.value_span.clone(), message);
+    }
+
+    /// Reports what the value that was read last is taken for.
+    pub(super) fn warn_of_value(&mut self, message: impl FnOnce() -> String) {
+        self.report.warn(self.value_span.clone(), message);
+    }
+
+    /// Reports that a word of another dialect is taken for `instead`.
+    pub(super) fn warn_synonym(&mut self, word: Word<'t>, instead: &str) {
+        self.report.warn(word.span(), || format!("{} is read as {instead}", shown(word.bytes)));
+    }
+}
+
+/// The light of a colour.
+pub(super) fn decode(color: DVec3, transfer: Transfer) -> DVec3 {
+    color.map(|number| transfer.decode(number))
 }

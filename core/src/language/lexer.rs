@@ -45,6 +45,11 @@ impl Word<'_> {
         self.start..self.end
     }
 
+    /// The word as text, for messages and paths.
+    pub(super) fn to_text(self) -> String {
+        String::from_utf8_lossy(self.bytes).into_owned()
+    }
+
     /// Whether it can only be meant as a number: it begins with a digit, a sign or a point.
     pub(super) fn is_number_like(&self) -> bool {
         let digits = unsigned(self.bytes);

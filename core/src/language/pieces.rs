@@ -25,32 +25,46 @@ use crate::{
 /// parsed but not yet kept takes little memory.
 pub(super) const PIECE: usize = 256 << 10;
 
-impl Triangles {
+/// Reads runs of plain triangle blocks.
+#[derive(Debug)]
+pub(super) struct Runs {
+    /// About how many bytes a piece has.
+    piece: usize,
+    /// Before this byte the text has to be read in order.
+    parallel_from: usize,
+}
+
+impl Runs {
+    /// Nothing was read yet.
+    pub(super) fn new(piece: usize) -> Self {
+        Self { piece, parallel_from: 0 }
+    }
+
     /// Reads plain triangle blocks from byte `at` of `text`, where one should begin, and gives
     /// the place of the first word that it leaves to others. `primitive` is the number of the
     /// next primitive.
-    pub(super) fn read_run<'t>(
+    pub(super) fn read<'t>(
         &mut self,
         text: &'t [u8],
         at: usize,
-        piece: usize,
+        triangles: &mut Triangles,
         primitive: &mut u64,
         symbols: &mut Symbols<'t>,
     ) -> usize {
         if (Scanner { text, at }).triangle().is_none() {
             return at;
         }
-        let key = self.key;
+        let (piece, key) = (self.piece, triangles.key);
         let threads = rayon::current_num_threads();
         if at < self.parallel_from || threads == 1 {
             let piece = Piece::parse(text, at, at.saturating_add(piece), key);
-            return self.adopt(&[piece], primitive, symbols);
+            return adopt(&[piece], triangles, primitive, symbols);
         }
         let count = PIECES_A_THREAD * threads;
         let mut window = Window::parse(text, at, piece, count, key);
         loop {
             let (adopted, next) = rayon::join(
-                || self.adopt(&window.pieces, primitive, symbols),
+                || adopt(&window.pieces, triangles, primitive, symbols),
                 || window.is_whole.then(|| Window::parse(text, window.end, piece, count, key)),
             );
             if adopted < window.end {
@@ -63,39 +77,39 @@ impl Triangles {
             }
         }
     }
+}
 
-    /// Takes over what was parsed as far as it is what reading on from the first piece would
-    /// have given; the answer is where that ends.
-    fn adopt<'t>(
-        &mut self,
-        pieces: &[Piece<'t>],
-        primitive: &mut u64,
-        symbols: &mut Symbols<'t>,
-    ) -> usize {
-        let mut at = pieces[0].start;
-        for piece in pieces {
-            if piece.start != at || *primitive + u64::from(piece.count) > u64::from(u32::MAX) {
-                break;
-            }
-            let names: Vec<u32> = piece
-                .names
-                .iter()
-                .map(|&(word, count)| symbols.use_on_flat(word, u64::from(count)))
-                .collect();
-            for (triangle, &hash) in piece.triangles.iter().zip(&piece.hashes) {
-                let triangle = Triangle {
-                    material: names[triangle.material as usize],
-                    primitive: triangle.primitive + *primitive as u32,
-                    ..*triangle
-                };
-                self.add_solid(triangle, None, hash, symbols);
-            }
-            self.dropped.zero_area += u64::from(piece.count) - piece.triangles.len() as u64;
-            *primitive += u64::from(piece.count);
-            at = piece.stop;
+/// Takes over what was parsed as far as it is what reading on from the first piece would
+/// have given; the answer is where that ends.
+fn adopt<'t>(
+    pieces: &[Piece<'t>],
+    triangles: &mut Triangles,
+    primitive: &mut u64,
+    symbols: &mut Symbols<'t>,
+) -> usize {
+    let mut at = pieces[0].start;
+    for piece in pieces {
+        if piece.start != at || *primitive + u64::from(piece.count) > u64::from(u32::MAX) {
+            break;
         }
-        at
+        let names: Vec<u32> = piece
+            .names
+            .iter()
+            .map(|&(word, count)| symbols.use_on_flat(word, u64::from(count)))
+            .collect();
+        for (triangle, &hash) in piece.triangles.iter().zip(&piece.hashes) {
+            let triangle = Triangle {
+                material: names[triangle.material as usize],
+                primitive: triangle.primitive + *primitive as u32,
+                ..*triangle
+            };
+            triangles.add_solid(triangle, None, hash, symbols);
+        }
+        triangles.dropped.zero_area += u64::from(piece.count) - piece.triangles.len() as u64;
+        *primitive += u64::from(piece.count);
+        at = piece.stop;
     }
+    at
 }
 
 /// Pieces that a thread has to parse before their triangles are taken over.
@@ -282,107 +296,5 @@ impl<'t> Scanner<'t> {
         let number = scan_number(self.text, &mut self.at)?;
         self.skip_space()?;
         Some(number)
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::{
-        language::reader::{Reading, read_scene_in_pieces},
-        transfer::Transfer,
-    };
-
-    /// Reads with pieces of a few bytes on two threads, with whole pieces on one thread, and
-    /// compares.
-    fn check_same(text: &str) -> Reading {
-        let read = |threads: usize, piece: usize| {
-            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-            pool.install(|| {
-                read_scene_in_pieces(
-                    text.as_bytes(),
-                    &|_| Err(std::io::ErrorKind::NotFound.into()),
-                    Transfer::None,
-                    piece,
-                )
-            })
-        };
-        let expected = read(1, usize::MAX);
-        for (threads, piece) in [(1, 1), (2, 1), (2, 100), (3, 333), (2, 1000), (2, PIECE)] {
-            let reading = read(threads, piece);
-            assert_eq!(
-                reading.diagnostics, expected.diagnostics,
-                "{threads} threads, pieces of {piece}"
-            );
-            assert_eq!(reading.omitted, expected.omitted);
-            assert_eq!(format!("{:?}", reading.scene), format!("{:?}", expected.scene));
-        }
-        expected
-    }
-
-    fn scene(shapes: impl IntoIterator<Item = String>) -> String {
-        let shapes: String = shapes.into_iter().collect();
-        format!(
-            "materials entry name a endentry entry name b endentry endmaterials\ngeometry\n{shapes}endgeometry\n"
-        )
-    }
-
-    fn triangle(k: usize) -> String {
-        let material = ["a", "b", "b"][k % 3];
-        format!(
-            "triangle\n\tvertex 0 0 {k}\n\tvertex 1 0 {k}.5\n\tvertex 0 1 {k}e-1\n\tmaterial {material}\nendtriangle\n"
-        )
-    }
-
-    #[test]
-    fn pieces_give_what_the_whole_gives() {
-        let reading = check_same(&scene((0..1000).map(triangle)));
-        assert_eq!(reading.scene.unwrap().triangles.len(), 1000);
-    }
-
-    #[test]
-    fn copies_and_flat_ones_are_found_across_pieces() {
-        let flat = "triangle vertex 0 0 0 vertex 1 1 1 vertex 2 2 2 material a endtriangle\n";
-        let reading = check_same(&scene(
-            (0..1000).map(|k| if k % 7 == 0 { flat.into() } else { triangle(k % 400) }),
-        ));
-        let scene = reading.scene.unwrap();
-        assert_eq!(
-            (scene.dropped.zero_area, scene.dropped.zero_area + scene.dropped.duplicates),
-            (143, 600)
-        );
-    }
-
-    #[test]
-    fn anything_between_plain_triangles_is_read() {
-        let odd = [
-            "# a comment\n triangle\n",
-            "sphere coords 0 0 0 radius 1 material a endsphere\n",
-            "triangle vertex 0 0 0 texcoord 0 0 vertex 1 0 0 texcoord 1 0 vertex 0 1 0 texcoord 0 1 material b endtriangle",
-            "triangle material a vertex 0 0 0 vertex 1 0 0 vertex 0 1 0 endtriangle triangle\n",
-            "triangle vertex 0 0 0\n vertex 1 0 0 vertex 0 1 x\n material\ntriangle\nendtriangle\n",
-            "union\n\n",
-            "endtriangle\n",
-            "endgeometry\ngeometry\n",
-            "triangle vertex 0 0 0 vertex 1 0 0 vertex 0 1 1e999 material a endtriangle\n",
-            "triangle vertex 0 0 0 vertex 1 0 0 vertex 0 1 0 material unknown endtriangle\n",
-            "fog\ntriangle\nendfog\n",
-            "… \u{a0}",
-        ];
-        for odd in odd {
-            for every in [1, 10, 97] {
-                check_same(&scene(
-                    (0..200).map(|k| {
-                        format!("{}{}", if k % every == 0 { odd } else { "" }, triangle(k))
-                    }),
-                ));
-            }
-        }
-    }
-
-    #[test]
-    fn triangles_on_one_line_are_read() {
-        let reading = check_same(&scene((0..500).map(|k| triangle(k).replace('\n', " "))));
-        assert_eq!(reading.scene.unwrap().triangles.len(), 500);
     }
 }

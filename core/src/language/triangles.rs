@@ -26,8 +26,6 @@ pub(super) struct Triangles {
     /// Nobody can write a file whose hashes collide: the key differs from run to run. It has no
     /// influence on what is kept.
     pub(super) key: u64,
-    /// Before this byte the text has to be read in order.
-    pub(super) parallel_from: usize,
 }
 
 impl Triangles {
@@ -39,7 +37,6 @@ impl Triangles {
             dropped: Dropped::default(),
             table: HashTable::new(),
             key: random_key(),
-            parallel_from: 0,
         }
     }
 

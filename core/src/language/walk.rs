@@ -11,7 +11,7 @@ use super::{
 
 /// The walk through the blocks of a text.
 #[derive(Debug)]
-pub(super) struct Blocks<'t> {
+pub(super) struct Walk<'t> {
     pub(super) lexer: Lexer<'t>,
     pub(super) report: Report,
     /// Outermost first.
@@ -29,7 +29,7 @@ pub(super) struct Blocks<'t> {
     look_ahead: usize,
 }
 
-impl<'t> Blocks<'t> {
+impl<'t> Walk<'t> {
     /// Starts at the beginning of `text`.
     pub(super) fn new(text: &'t [u8], report: Report) -> Self {
         Self {

@@ -810,7 +810,7 @@ mod tests {
 
     use super::*;
     use crate::{
-        language::reader::read_scene,
+        language::read_scene,
         prepare::prepare,
         prepared::{PreparedBytes, PreparedScene},
     };

@@ -1,6 +1,6 @@
 //! Texts that nobody means well by: every one is answered soon, and with little memory.
 
-use rtfarm_core::read::{Reading, Style, draw_diagnostics, read_scene};
+use rtfarm_core::language::{Reading, Style, draw_diagnostics, read_scene};
 
 fn read(text: &[u8]) -> Reading {
     let reading = read_scene(text, &|_| Err(std::io::ErrorKind::NotFound.into()));

@@ -4,7 +4,7 @@ use std::io;
 
 use glam::{DVec2, DVec3};
 use rtfarm_core::{
-    read::{Reading, read_scene},
+    language::{Reading, read_scene},
     scene::{Dropped, Operation, Scene, SolidNode},
     tile::Size,
 };

@@ -3,7 +3,7 @@
 use std::fmt::Write;
 
 use rtfarm_core::{
-    mesh_file::{MeshFault, read_mesh},
+    assets::mesh::{MeshFault, read_mesh},
     scene::{Dropped, MeshShape, MeshVertices},
 };
 

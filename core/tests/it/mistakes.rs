@@ -2,7 +2,7 @@
 
 use std::io;
 
-use rtfarm_core::read::read_scene;
+use rtfarm_core::language::read_scene;
 
 /// Checks all that is told about a text.
 fn check_told(text: &str, told: &[&str]) {

@@ -3,7 +3,7 @@
 use std::{fs, path::PathBuf};
 
 use rtfarm_core::{
-    read::{Reading, Severity, read_scene},
+    language::{Reading, Severity, read_scene},
     scene::Dropped,
 };
 

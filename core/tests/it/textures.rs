@@ -6,12 +6,12 @@ use std::{fs, io::Cursor, ops::ControlFlow, path::Path};
 use glam::DVec2;
 use image::{DynamicImage, ImageFormat, RgbImage, RgbaImage};
 use rtfarm_core::{
+    assets::texture::read_texture,
     isa::Isa,
-    read::read_scene,
+    language::read_scene,
     render::{Settings, render_tile},
     sample::Samples,
     scene::{Scene, Texture},
-    texture::read_texture,
     tile::Area,
 };
 use rtfarm_oracle::{

@@ -5,8 +5,8 @@ use std::io::Cursor;
 
 use image::{DynamicImage, ImageFormat, RgbImage};
 use rtfarm_core::{
+    language::{Reading, read_scene_with},
     picture::{Picture, PictureFormat},
-    read::{Reading, read_scene_with},
     render::Settings,
     scene::Scene,
     transfer::Transfer,

@@ -1,0 +1,105 @@
+//! The files that a scene names: textures and meshes.
+
+use std::{collections::HashMap, io, sync::Arc};
+
+use super::{
+    diagnostic::{Report, shown},
+    lexer::Word,
+};
+use crate::{
+    assets::{mesh, texture},
+    scene::Scene,
+};
+
+/// Reads the bytes of a file that a scene names; the path is as the scene has it.
+pub type Resolve<'a> = dyn Fn(&str) -> io::Result<Vec<u8>> + Sync + 'a;
+
+/// Reads every image once, whatever its paths, and gives it to the materials that name it.
+pub(super) fn read_textures(
+    names: &[(u32, Word<'_>)],
+    resolve: &Resolve<'_>,
+    report: &mut Report,
+    scene: &mut Scene,
+) {
+    let mut files = Files::new("texture", resolve, report);
+    for &(material, name) in names {
+        let texture = files.read(name, |path, bytes| {
+            let texture = texture::read_texture(path, bytes).map_err(|error| error.to_string())?;
+            scene.textures.push(texture);
+            Ok(scene.textures.len() as u32 - 1)
+        });
+        scene.materials[material as usize].texture = texture;
+    }
+}
+
+/// Reads every mesh file once, whatever its paths; `names` are those of the scene's meshes.
+pub(super) fn read_meshes(
+    names: &[Word<'_>],
+    resolve: &Resolve<'_>,
+    report: &mut Report,
+    scene: &mut Scene,
+) {
+    let mut files = Files::new("mesh", resolve, report);
+    for (mesh, &name) in scene.meshes.iter_mut().zip(names) {
+        let shape = files.read(name, |path, bytes| {
+            let file = mesh::read_mesh(path, bytes).map_err(|error| error.to_string())?;
+            scene.dropped.zero_area += file.dropped.zero_area;
+            scene.dropped.duplicates += file.dropped.duplicates;
+            Ok(Arc::new(file.shape))
+        });
+        if let Some(shape) = shape {
+            mesh.shape = shape;
+        }
+    }
+}
+
+/// Files of one kind that are read once each, whatever their paths.
+struct Files<'a, 't, T> {
+    /// What one is called.
+    noun: &'static str,
+    resolve: &'a Resolve<'a>,
+    report: &'a mut Report,
+    /// `None` for a file that cannot be read.
+    by_path: HashMap<&'t [u8], Option<T>>,
+    by_content: HashMap<blake3::Hash, T>,
+}
+
+impl<'a, 't, T: Clone> Files<'a, 't, T> {
+    fn new(noun: &'static str, resolve: &'a Resolve<'a>, report: &'a mut Report) -> Self {
+        Self { noun, resolve, report, by_path: HashMap::new(), by_content: HashMap::new() }
+    }
+
+    /// What `decode` makes of the path and the bytes of a file, unless its content is known;
+    /// `None` when it cannot be read, which is reported where it is named first.
+    fn read(
+        &mut self,
+        name: Word<'t>,
+        decode: impl FnOnce(&str, &[u8]) -> Result<T, String>,
+    ) -> Option<T> {
+        if let Some(known) = self.by_path.get(name.bytes) {
+            return known.clone();
+        }
+        let file = self.decode(&name.to_text(), decode);
+        let file = file.map_err(|error| {
+            self.report.error(name.span(), || {
+                format!("cannot read the {} {}: {error}", self.noun, shown(name.bytes))
+            });
+        });
+        self.by_path.entry(name.bytes).or_insert(file.ok()).clone()
+    }
+
+    fn decode(
+        &mut self,
+        path: &str,
+        decode: impl FnOnce(&str, &[u8]) -> Result<T, String>,
+    ) -> Result<T, String> {
+        let bytes = (self.resolve)(path).map_err(|error| error.to_string())?;
+        let hash = blake3::hash(&bytes);
+        if let Some(known) = self.by_content.get(&hash) {
+            return Ok(known.clone());
+        }
+        let file = decode(path, &bytes)?;
+        self.by_content.insert(hash, file.clone());
+        Ok(file)
+    }
+}
