@@ -5,13 +5,12 @@ use std::{
     fs,
     io::{self, Write},
     path::Path,
-    sync::Mutex,
     time::Duration,
 };
 
 use anyhow::{Context, anyhow};
 use rtfarm_coordinator::{Progress, Wish};
-use rtfarm_core::{language::read_scene, tile::Size};
+use rtfarm_core::{language::referenced_files, tile::Size};
 use rtfarm_proto::{
     CHUNK_BYTES, MESSAGE_BYTES, PROTOCOL,
     wire::{self, event, jobs_client::JobsClient, submit_request::Part, submit_response::Outcome},
@@ -139,13 +138,8 @@ async fn submit(
 /// The files that a scene names, by the names that it has for them. One that cannot be read is
 /// left out: the coordinator will miss it where the scene names it.
 fn named_files(text: &[u8], folder: &Path) -> BTreeMap<String, Vec<u8>> {
-    let files = Mutex::new(BTreeMap::new());
-    read_scene(text, &|path: &str| {
-        let data = fs::read(folder.join(path))?;
-        files.lock().expect("nothing here panics").insert(path.to_owned(), data.clone());
-        Ok(data)
-    });
-    files.into_inner().expect("nothing here panics")
+    let read = |path: String| fs::read(folder.join(&path)).ok().map(|data| (path, data));
+    referenced_files(text).into_iter().filter_map(read).collect()
 }
 
 /// Waits for the job's end. Answers with the last event and the time that the rendering took.

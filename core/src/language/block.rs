@@ -122,6 +122,11 @@ impl Block {
         }
     }
 
+    /// Whether a word is one of its fields.
+    pub(super) fn has_field(self, word: &[u8]) -> bool {
+        self.fields().iter().any(|field| field.as_bytes() == word)
+    }
+
     /// Whether it holds fields only.
     pub(super) fn is_leaf(self) -> bool {
         !self.is_operation()

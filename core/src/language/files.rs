@@ -1,10 +1,18 @@
 //! The files that a scene names: textures and meshes.
 
-use std::{collections::HashMap, io, sync::Arc};
+use std::{
+    collections::{HashMap, HashSet},
+    io,
+    sync::Arc,
+};
 
 use super::{
+    block::Block,
     diagnostic::{Report, shown},
+    encoding::check_encoding,
     lexer::Word,
+    pieces::skip_plain_triangles,
+    walk::Walk,
 };
 use crate::{
     assets::{mesh, texture},
@@ -13,6 +21,60 @@ use crate::{
 
 /// Reads the bytes of a file that a scene names; the path is as the scene has it.
 pub type Resolve<'a> = dyn Fn(&str) -> io::Result<Vec<u8>> + Sync + 'a;
+
+/// The files that a scene text names, each once and in the order of the text: the textures of its
+/// materials and its meshes, under the names that it has for them. For a text without mistakes
+/// they are those that reading it asks for; of one with mistakes they may be more. Nothing is
+/// opened or decoded.
+///
+/// ```
+/// use rtfarm_core::language::referenced_files;
+///
+/// let text = b"materials entry name a texture \"my wood.png\" endentry endmaterials
+///     geometry mesh file bottle.stl material a endmesh endgeometry # file none.obj";
+/// assert_eq!(referenced_files(text), ["my wood.png", "bottle.stl"]);
+/// ```
+pub fn referenced_files(text: &[u8]) -> Vec<String> {
+    let mut unheard = Report::default();
+    if !check_encoding(text, &mut unheard) {
+        return Vec::new();
+    }
+    let mut walk = Walk::new(text, unheard);
+    let mut known = HashSet::new();
+    let mut names = Vec::new();
+    // The file of each open block; a field that stands twice counts once, the last time.
+    let mut open: Vec<Option<Word<'_>>> = Vec::new();
+    loop {
+        let Some(word) = walk.next() else {
+            let Some(file) = open.pop() else { return names };
+            names.extend(file.filter(|file| known.insert(file.bytes)).map(|file| file.to_text()));
+            continue;
+        };
+        if let Some(block) = Block::opened_by(&word) {
+            let end = skip_plain_triangles(text, word.start);
+            if end > word.start {
+                walk.lexer.go_to(end);
+            } else {
+                walk.enter(block, word);
+                open.push(None);
+            }
+            continue;
+        }
+        match (walk.innermost(), word.bytes) {
+            (Block::Entry, b"texture" | b"image")
+            | (Block::Mesh | Block::StlModel, b"file" | b"filename") => {
+                let file = walk.file_name(word);
+                if let Some(open) = open.last_mut() {
+                    *open = file;
+                }
+            }
+            (Block::Entry, b"name") => _ = walk.value_word(word, "a name"),
+            (_, b"material") => _ = walk.value_word(word, "the name of a material"),
+            (block, field) if block.has_field(field) => {}
+            _ => walk.skip_unknown_keyword(word),
+        }
+    }
+}
 
 /// Reads every image once, whatever its paths, and gives it to the materials that name it.
 pub(super) fn read_textures(

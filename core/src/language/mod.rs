@@ -29,7 +29,7 @@ mod reader;
 pub use self::{
     diagnostic::{Diagnostic, Omitted, Related, Severity},
     drawing::{Style, draw_diagnostics},
-    files::Resolve,
+    files::{Resolve, referenced_files},
     reader::Reading,
 };
 

@@ -112,6 +112,17 @@ fn adopt<'t>(
     at
 }
 
+/// Goes over plain triangle blocks from byte `at` of `text` on, and gives the place of the first
+/// word that is none of theirs.
+pub(super) fn skip_plain_triangles(text: &[u8], at: usize) -> usize {
+    let mut scanner = Scanner { text, at };
+    let mut end = at;
+    while scanner.triangle().is_some() {
+        end = scanner.at;
+    }
+    end
+}
+
 /// Pieces that a thread has to parse before their triangles are taken over.
 const PIECES_A_THREAD: usize = 2;
 
