@@ -10,7 +10,7 @@ use crate::scene::Texture;
 #[derive(Debug, thiserror::Error)]
 pub enum TextureError {
     /// Neither its bytes nor its name are those of a format.
-    #[error("it is no PNG, JPEG, BMP, TGA or WebP file")]
+    #[error("it is not a PNG, JPEG, BMP, TGA or WebP file")]
     UnknownFormat,
     /// It is broken.
     #[error("{0}")]
@@ -19,7 +19,7 @@ pub enum TextureError {
     #[error("it has no texels")]
     Empty,
     /// It would take memory out of all proportion to its file.
-    #[error("it has {width} x {height} texels in {bytes} bytes: a bomb")]
+    #[error("it has {width} x {height} texels in only {bytes} bytes, which no real image has")]
     Bomb {
         /// Its width in texels.
         width: u32,
@@ -30,7 +30,7 @@ pub enum TextureError {
     },
     /// It would take too much memory.
     #[error(
-        "it has {width} x {height} texels; at most {MOST_TEXELS} are read, in sides of at most {LONGEST_SIDE}"
+        "it has {width} x {height} texels; at most {MOST_TEXELS} are allowed, in sides of at most {LONGEST_SIDE}"
     )]
     TooLarge {
         /// Its width in texels.

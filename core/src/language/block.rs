@@ -158,7 +158,7 @@ impl Block {
     pub(super) fn home(self) -> &'static str {
         match self {
             Self::File | Self::Viewport | Self::Materials | Self::Lights | Self::Geometry => {
-                "no other block"
+                "the file itself"
             }
             Self::Screen => "`viewport`",
             Self::Entry => "`materials`",

@@ -213,22 +213,28 @@ impl Places {
 /// What some editors put in front of UTF-8.
 pub(super) const BYTE_ORDER_MARK: &[u8] = b"\xef\xbb\xbf";
 
-/// `word` for a message: in backquotes, without what would break the line, cut when long.
-pub(super) fn shown(word: &[u8]) -> String {
+/// A count of numbers for a message: `one number`, `3 numbers`.
+pub(super) fn number_count(count: usize) -> String {
+    if count == 1 { "one number".into() } else { format!("{count} numbers") }
+}
+
+/// Puts `word` into backquotes for a message, without what would break the line, and cuts it when
+/// it is long.
+pub(super) fn quoted(word: &[u8]) -> String {
     const LONGEST: usize = 60;
     let text = String::from_utf8_lossy(&word[..word.len().min(4 * LONGEST)]);
     let mut characters = text.chars();
-    let mut shown = String::new();
+    let mut visible = String::new();
     for character in characters.by_ref().take(LONGEST) {
         match character {
-            '"' | '\'' | '\\' => shown.push(character),
-            _ => shown.extend(character.escape_debug()),
+            '"' | '\'' | '\\' => visible.push(character),
+            _ => visible.extend(character.escape_debug()),
         }
     }
     if characters.next().is_some() || word.len() > 4 * LONGEST {
-        shown.push('…');
+        visible.push('…');
     }
-    format!("`{shown}`")
+    format!("`{visible}`")
 }
 
 #[cfg(test)]
@@ -247,7 +253,7 @@ mod tests {
 
     #[test]
     fn words_in_messages_are_short_and_visible() {
-        assert_eq!(shown(b"a\0b\x1b\xff"), "`a\\0b\\u{1b}\u{fffd}`");
-        assert_eq!(shown("я".repeat(1000).as_bytes()), format!("`{}…`", "я".repeat(60)));
+        assert_eq!(quoted(b"a\0b\x1b\xff"), "`a\\0b\\u{1b}\u{fffd}`");
+        assert_eq!(quoted("я".repeat(1000).as_bytes()), format!("`{}…`", "я".repeat(60)));
     }
 }

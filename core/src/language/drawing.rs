@@ -78,7 +78,7 @@ struct Excerpt {
 }
 
 impl Excerpt {
-    /// Bytes that are shown on either side of the marked ones, and of those at most.
+    /// Bytes that are quoted on either side of the marked ones, and of those at most.
     const REACH: usize = 60;
 
     fn new(text: &[u8], at: Place, span: &Range<usize>) -> Self {

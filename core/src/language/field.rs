@@ -4,7 +4,7 @@ use glam::DVec3;
 
 use super::{
     block::{Block, is_keyword},
-    diagnostic::{Report, shown},
+    diagnostic::{Report, number_count, quoted},
     lexer::{Quotes, Word},
     walk::Walk,
 };
@@ -31,8 +31,13 @@ impl<'t, T> Field<'t, T> {
         if let Some(earlier) = self.word.replace(word) {
             report.warn_with(
                 word.span(),
-                || format!("{} stands here again; this one counts", shown(word.bytes)),
-                || Some((earlier.span(), "the earlier one".into())),
+                || {
+                    format!(
+                        "{} is given again; this value replaces the earlier one",
+                        quoted(word.bytes)
+                    )
+                },
+                || Some((earlier.span(), "the earlier value".into())),
             );
         }
         self.value = value;
@@ -42,7 +47,7 @@ impl<'t, T> Field<'t, T> {
     pub(super) fn require(self, walk: &mut Walk<'t>, block: Word<'t>, field: &str) -> Option<T> {
         if self.word.is_none() && !walk.is_cut {
             walk.report
-                .error(block.span(), || format!("this {} has no `{field}`", shown(block.bytes)));
+                .error(block.span(), || format!("this {} has no `{field}`", quoted(block.bytes)));
         }
         self.value
     }
@@ -89,7 +94,7 @@ impl<'t> Walk<'t> {
         std::iter::from_fn(|| ahead.next()).take(2).take_while(Word::is_number_like).count()
     }
 
-    /// Whether a word behind byte `end` is meant as a value: anything on the same line but a
+    /// Whether a word after byte `end` is meant as a value: anything on the same line but a
     /// keyword, and on later lines what looks like a number.
     fn is_value(&self, word: &Word<'t>, end: usize) -> bool {
         word.is_number_like() || (self.is_on_one_line(end..word.start) && !is_keyword(word))
@@ -97,31 +102,25 @@ impl<'t> Walk<'t> {
 
     fn report_missing_numbers(&mut self, field: Word<'t>, end: usize, count: usize, needed: usize) {
         self.report.error(field.start..end, || {
-            let numbers =
-                if needed == 1 { "one number".into() } else { format!("{needed} numbers") };
+            let numbers = number_count(needed);
             let found = match count {
-                0 => "none".into(),
-                _ => format!("only {count}"),
+                0 => "none is given".into(),
+                1 => "only 1 is given".into(),
+                _ => format!("only {count} are given"),
             };
-            format!(
-                "{} takes {numbers}, but {found} {} here",
-                shown(field.bytes),
-                if count > 1 { "stand" } else { "stands" }
-            )
+            format!("{} takes {numbers}, but {found}", quoted(field.bytes))
         });
     }
 
     fn report_bad_number(&mut self, word: &Word<'t>, needed: usize) {
         let field = self.last_field.map_or(*word, |(field, _)| field);
         self.report.error(word.span(), || {
-            let shown = shown(word.bytes);
+            let found = quoted(word.bytes);
             if word.is_named_infinity_or_nan() {
-                return format!(
-                    "{shown} cannot be computed with; a finite number should stand here"
-                );
+                return format!("expected a finite number, found {found}");
             }
             if word.number().is_some() {
-                return format!("{shown} is too large: numbers go up to about 1.8e308");
+                return format!("{found} is too large; the largest number is about 1.8e308");
             }
             let with_points: Vec<u8> =
                 word.bytes.iter().map(|&byte| if byte == b',' { b'.' } else { byte }).collect();
@@ -130,21 +129,15 @@ impl<'t> Walk<'t> {
                 && (Word { bytes: number, ..*word }).number().is_some()
             {
                 return format!(
-                    "{shown} is no number: spaces alone stand between numbers, no commas"
+                    "{found} is not a number; numbers are separated by spaces, not by commas"
                 );
             }
             if pointed.number().is_some() {
-                let right = String::from_utf8_lossy(&with_points).into_owned();
-                return format!(
-                    "{shown} is no number: the decimal sign is a point, as in `{right}`"
-                );
+                let right = pointed.to_text();
+                return format!("{found} is not a number; write its decimal point as in `{right}`");
             }
-            let numbers =
-                if needed == 1 { "one number".into() } else { format!("{needed} numbers") };
-            format!(
-                "{shown} is no number; {} takes {numbers}",
-                crate::language::diagnostic::shown(field.bytes)
-            )
+            let (field, numbers) = (quoted(field.bytes), number_count(needed));
+            format!("{found} is not a number; {field} takes {numbers}")
         });
     }
 
@@ -157,19 +150,23 @@ impl<'t> Walk<'t> {
         };
         let Some(word) = self.lexer.peek().filter(|word| !is_missing(word)) else {
             self.report.error(field.span(), || {
-                format!("{} takes {what}, but none stands here", shown(field.bytes))
+                format!("{} takes {what}, but none is given", quoted(field.bytes))
             });
             return None;
         };
         self.lexer.go_to(word.end);
         match word.quotes {
             Quotes::Open => {
-                self.report.error(word.span(), || "this quote is not closed on its line".into());
+                self.report
+                    .error(word.span(), || "this name has no closing quote on its line".into());
                 None
             }
             Quotes::Closed if word.bytes.is_empty() => {
                 self.report.error(word.span(), || {
-                    format!("{} takes {what}, not nothing", shown(field.bytes))
+                    format!(
+                        "{} takes {what}, but nothing is between the quotes",
+                        quoted(field.bytes)
+                    )
                 });
                 None
             }
@@ -177,7 +174,7 @@ impl<'t> Walk<'t> {
         }
     }
 
-    /// Whether a file name is all that stands on its line; if not, it wants quotes, and that is
+    /// Whether a file name is the last value on its line. If it is not, it needs quotes, which is
     /// reported.
     pub(super) fn ends_file_name(&mut self, name: Word<'t>) -> bool {
         let is_continued = name.quotes == Quotes::Bare
@@ -190,7 +187,7 @@ impl<'t> Walk<'t> {
             self.skip_line();
             let end = self.lexer.at();
             self.report.error(name.start..end, || {
-                "a file name with spaces stands in double quotes".into()
+                "a file name with spaces must be in double quotes".into()
             });
         }
         !is_continued
@@ -206,7 +203,9 @@ impl<'t> Walk<'t> {
     pub(super) fn number_above_zero(&mut self, field: Word<'t>) -> Option<f64> {
         let value = self.number(field)?;
         if value <= 0.0 {
-            self.refuse_value(|| format!("{} must be above 0, but is {value}", shown(field.bytes)));
+            self.refuse_value(|| {
+                format!("{} must be above 0, but is {value}", quoted(field.bytes))
+            });
         }
         (value > 0.0).then_some(value)
     }
@@ -216,7 +215,7 @@ impl<'t> Walk<'t> {
         let value = self.number(field)?;
         if value < 0.0 {
             self.refuse_value(|| {
-                format!("{} must be 0 or more, but is {value}", shown(field.bytes))
+                format!("{} must be 0 or more, but is {value}", quoted(field.bytes))
             });
         }
         (value >= 0.0).then_some(value)
@@ -243,7 +242,7 @@ impl<'t> Walk<'t> {
         if !is_color {
             self.refuse_value(|| {
                 format!(
-                    "the parts of a colour must be 0 or more, but one is {}",
+                    "the components of a colour must be 0 or more, but one is {}",
                     color.min_element()
                 )
             });
@@ -255,7 +254,9 @@ impl<'t> Walk<'t> {
     pub(super) fn light(&mut self, field: Word<'t>, transfer: Transfer) -> Option<DVec3> {
         let light = decode(self.color(field)?, transfer);
         if !light.is_finite() {
-            self.refuse_value(|| "this colour is too bright to be computed with".into());
+            self.refuse_value(|| {
+                "this colour is too bright; the largest amount of light is about 1.8e308".into()
+            });
         }
         light.is_finite().then_some(light)
     }
@@ -272,7 +273,7 @@ impl<'t> Walk<'t> {
 
     /// Reports that a word of another dialect is taken for `instead`.
     pub(super) fn warn_synonym(&mut self, word: Word<'t>, instead: &str) {
-        self.report.warn(word.span(), || format!("{} is read as {instead}", shown(word.bytes)));
+        self.report.warn(word.span(), || format!("{} is read as {instead}", quoted(word.bytes)));
     }
 }
 

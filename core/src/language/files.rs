@@ -8,7 +8,7 @@ use std::{
 
 use super::{
     block::Block,
-    diagnostic::{Report, shown},
+    diagnostic::{Report, quoted},
     encoding::check_encoding,
     lexer::Word,
     pieces::skip_plain_triangles,
@@ -144,7 +144,7 @@ impl<'a, 't, T: Clone> Files<'a, 't, T> {
         let file = self.decode(&name.to_text(), decode);
         let file = file.map_err(|error| {
             self.report.error(name.span(), || {
-                format!("cannot read the {} {}: {error}", self.noun, shown(name.bytes))
+                format!("cannot read the {} {}: {error}", self.noun, quoted(name.bytes))
             });
         });
         self.by_path.entry(name.bytes).or_insert(file.ok()).clone()

@@ -5,8 +5,8 @@ use std::sync::Arc;
 use glam::{DVec2, DVec3};
 
 use super::{
-    block::Block, diagnostic::shown, direction::direction, field::Field, lexer::Word, pieces::Runs,
-    symbol::Symbols, triangles::Triangles, walk::Walk,
+    block::Block, diagnostic::quoted, direction::direction, field::Field, lexer::Word,
+    pieces::Runs, symbol::Symbols, triangles::Triangles, walk::Walk,
 };
 use crate::{
     exact::predicates::{self, QuadrangleFault},
@@ -100,9 +100,9 @@ impl<'t> Shapes<'t> {
                     let outer = outer.opening;
                     walk.report.error(word.span(), || {
                         format!(
-                            "{} takes solids: spheres, parallelepipeds and operations on them, no {}",
-                            shown(outer.bytes),
-                            word.to_text()
+                            "{} is not a solid; {} takes spheres, parallelepipeds and operations on them",
+                            quoted(word.bytes),
+                            quoted(outer.bytes)
                         )
                     });
                 }
@@ -207,22 +207,22 @@ impl<'t> Shapes<'t> {
         match predicates::check_quadrangle(vertices) {
             Ok(None) => {}
             Ok(Some(deviation)) => walk.report.warn(opening.span(), || {
-                format!("this quadrangle is planar only to within {deviation:.3e}; taken as planar")
+                format!("this quadrangle is planar only to within {deviation:.3e}, but is taken as planar")
             }),
             Err(fault) => {
                 walk.report.error(opening.span(), || match fault {
                     QuadrangleFault::Degenerate => {
-                        "this quadrangle has no area: its vertices are on one line".into()
+                        "this quadrangle has no area: its vertices lie on one line".into()
                     }
                     QuadrangleFault::SamePlace => {
-                        "this quadrangle has two vertices in one place; three make a triangle".into()
+                        "two vertices of this quadrangle are equal; write a shape of three vertices as a `triangle`".into()
                     }
                     QuadrangleFault::Crossing => {
-                        "the sides of this quadrangle cross or touch; its vertices must stand in their order around it".into()
+                        "the sides of this quadrangle cross or touch; its vertices must go around it in order".into()
                     }
                     QuadrangleFault::NotPlanar { deviation, tolerance } => format!(
-                        "this quadrangle is not planar: its vertices are {deviation:.3e} off their plane, and \
-                         {tolerance:.3e} is the most; two triangles could be bent so"
+                        "this quadrangle is not planar: its vertices are {deviation:.3e} away from their plane, and at \
+                         most {tolerance:.3e} is allowed; use two triangles instead"
                     ),
                 });
                 return;
@@ -333,9 +333,9 @@ impl<'t> Shapes<'t> {
 fn finish_operation(walk: &mut Walk<'_>, done: &OpenOperation<'_>, nodes: &mut Vec<SolidNode>) {
     let OpenOperation { opening, operation, operands } = *done;
     if operands < 2 && !walk.is_cut {
-        let found = if operands == 0 { "none" } else { "only one" };
+        let found = if operands == 0 { "none is given" } else { "only one is given" };
         walk.report.error(opening.span(), || {
-            format!("{} joins two or more solids, but {found} stands here", shown(opening.bytes))
+            format!("{} joins two or more solids, but {found}", quoted(opening.bytes))
         });
     }
     nodes.push(SolidNode::Operation { operation, operands });
@@ -396,7 +396,7 @@ fn read_parallelepiped<'t>(
     let edges = [1, 2, 3].map(|k| vertices[k] - corner);
     if predicates::is_coplanar(vertices[0], vertices[1], vertices[2], vertices[3]) {
         walk.report.error(opening.span(), || {
-            "this parallelepiped has no volume: its vertices are a corner and that corner's three \
+            "this parallelepiped has no volume; its vertices must be a corner and that corner's three \
                  neighbours, not all in one plane"
                 .into()
         });
@@ -404,18 +404,18 @@ fn read_parallelepiped<'t>(
     }
     if !edges.iter().all(|edge| edge.is_finite()) {
         walk.report.error(opening.span(), || {
-            "this parallelepiped is too large to be computed with".into()
+            "this parallelepiped is too large; the longest edge is about 1.8e308".into()
         });
         return None;
     }
     let condition = condition(edges);
     if condition.is_nan() || condition > MOST_SHEARED {
         walk.report.error(opening.span(), || {
-                format!(
-                    "this parallelepiped is too flat to be computed with: its condition number is {condition:.1e}, \
-                     and {MOST_SHEARED:.0e} is the most"
-                )
-            });
+            format!(
+                "this parallelepiped is too flat: its condition number is {condition:.1e}, \
+                     and at most {MOST_SHEARED:.0e} is allowed"
+            )
+        });
         return None;
     }
     Some(Parallelepiped { corner, edges, material, primitive })
@@ -441,7 +441,7 @@ fn read_corners<'t, const N: usize>(
                 match vertices.get_mut(count) {
                     Some(place) => *place = vertex.unwrap_or_default(),
                     None if count == N => walk.report.error(word.span(), || {
-                        format!("a {shape} has {N} vertices; this is one more")
+                        format!("a {shape} has {N} vertices, but this is one more")
                     }),
                     None => {}
                 }
@@ -466,8 +466,8 @@ fn read_corners<'t, const N: usize>(
                         is_sound = false;
                         walk.report.error(word.span(), || {
                             format!(
-                                "{} stands behind the vertex that it belongs to",
-                                shown(word.bytes)
+                                "{} must come after the vertex that it belongs to",
+                                quoted(word.bytes)
                             )
                         });
                     }
@@ -492,7 +492,7 @@ fn read_corners<'t, const N: usize>(
     if count >= N && with_texcoords > 0 && with_texcoords < N {
         is_sound = false;
         walk.report.error(opening.span(), || {
-            format!("every vertex has a `texcoord` or none has; here {with_texcoords} of {N} have")
+            format!("a `texcoord` is given for {with_texcoords} of {N} vertices; give one for all of them or for none")
         });
     }
     let material = material.require(walk, opening, "material")?;

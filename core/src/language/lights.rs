@@ -73,7 +73,7 @@ impl<'t> Lights<'t> {
         for (field, name) in [(&power, "power"), (&distance, "distance")] {
             if field.word.is_none() {
                 walk.report.warn(opening.span(), || {
-                    format!("this `reference` has no `{name}`; taken as 1")
+                    format!("this `reference` has no `{name}`, which is taken as 1")
                 });
             }
         }
@@ -120,8 +120,8 @@ impl<'t> Lights<'t> {
             let intensity = light.power / power * distance * distance * light.color;
             if !intensity.is_finite() {
                 report.error(light.word.span(), || {
-                    "this light is too bright to be computed with: its power over the reference's, times the \
-                     reference's distance squared, is beyond 1.8e308"
+                    "this light is too bright: its power divided by the reference's, times the square of \
+                     the reference's distance, exceeds 1.8e308"
                         .into()
                 });
             }
@@ -136,14 +136,14 @@ fn read_ambient<'t>(walk: &mut Walk<'t>, word: Word<'t>) -> Option<DVec3> {
     let light = match walk.numbers_that_follow() {
         0 => DVec3::splat(first),
         1 => {
-            walk.refuse_value(|| "`ambient` takes one number or three, but two stand here".into());
+            walk.refuse_value(|| "`ambient` takes one number or three, but two are given".into());
             walk.number(word);
             return None;
         }
         _ => walk.numbers(word).map(|[g, b]| DVec3::new(first, g, b) / 255.0)?,
     };
     if light.min_element() < 0.0 {
-        walk.refuse_value(|| "ambient light must be 0 or more".into());
+        walk.refuse_value(|| "the numbers of `ambient` must be 0 or more".into());
         return None;
     }
     Some(light)

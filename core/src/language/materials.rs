@@ -4,7 +4,7 @@ use glam::DVec3;
 
 use super::{
     block::Block,
-    diagnostic::{Report, shown},
+    diagnostic::{Report, quoted},
     field::{Field, decode},
     lexer::Word,
     suggestion::suggestion,
@@ -90,16 +90,16 @@ impl<'t> Materials<'t> {
         if let Some((_, first)) = symbols.get(symbol).definition {
             walk.report.error_with(
                 name.span(),
-                || format!("a material {} is there already", shown(name.bytes)),
-                || Some((first.span(), "the first one".into())),
+                || format!("another material is already named {}", quoted(name.bytes)),
+                || Some((first.span(), "the first material of this name".into())),
             );
             return;
         }
         if !is_identifier(name.bytes) {
             walk.report.warn(name.span(), || {
                 format!(
-                    "{} is no C++ identifier (letters, digits and `_`, no digit first); taken as it is",
-                    shown(name.bytes)
+                    "{} is not an identifier (letters, digits and `_`, with no digit first), but it is used as it is",
+                    quoted(name.bytes)
                 )
             });
         }
@@ -125,16 +125,18 @@ impl<'t> Materials<'t> {
                 report.error(word.span(), || {
                     let names = candidates.iter().map(|known| known.name.as_str());
                     let hint = suggestion(symbol.name, names)
-                        .map(|guess| format!("; did you mean {}?", shown(guess.as_bytes())));
+                        .map(|guess| format!("; did you mean {}?", quoted(guess.as_bytes())));
                     let times = (symbol.use_count > 1)
-                        .then(|| format!(" (used {} times)", symbol.use_count));
+                        .then(|| format!(", but it is used {} times", symbol.use_count));
                     let (hint, times) = (hint.unwrap_or_default(), times.unwrap_or_default());
-                    format!("no material is named {}{hint}{times}", shown(symbol.name))
+                    format!("no material is named {}{times}{hint}", quoted(symbol.name))
                 });
             }
             if let (true, Some((word, shape))) = (symbol.is_textured, symbol.untexturable) {
                 report.warn(word.span(), || {
-                    format!("textures are for triangles and quadrangles; this {shape} shows none")
+                    format!(
+                        "a texture shows only on triangles and quadrangles, not on this {shape}"
+                    )
                 });
             }
         }
@@ -147,7 +149,7 @@ fn clamp_color(walk: &mut Walk<'_>, parts: [f64; 3], transfer: Transfer) -> DVec
     if parts.iter().any(|part| !(0.0..=255.0).contains(part)) {
         walk.warn_of_value(|| {
             let [r, g, b] = clamped;
-            format!("the parts of a colour are from 0 to 255; taken as {r} {g} {b}")
+            format!("the components of a colour go from 0 to 255; this one is taken as {r} {g} {b}")
         });
     }
     decode(DVec3::from(clamped) / 255.0, transfer)
@@ -158,7 +160,7 @@ fn clamp_alpha(walk: &mut Walk<'_>, alpha: f64) -> f64 {
     let clamped = alpha.clamp(0.0, 1.0);
     if !(0.0..=1.0).contains(&alpha) {
         walk.warn_of_value(|| {
-            format!("alpha is from 0, clear, to 1, opaque; {alpha} is taken as {clamped}")
+            format!("`alpha` goes from 0 (clear) to 1 (opaque); {alpha} is taken as {clamped}")
         });
     }
     clamped
@@ -171,12 +173,12 @@ fn share(walk: &mut Walk<'_>, reflect: f64) -> Option<f64> {
         1.0..=100.0 => {
             let share = reflect / 100.0;
             walk.warn_of_value(|| {
-                format!("reflect is from 0 to 1; {reflect} is read as percent, {share}")
+                format!("`reflect` goes from 0 to 1; {reflect} is read as a percentage, {share}")
             });
             Some(share)
         }
         _ => {
-            walk.refuse_value(|| format!("reflect must be from 0 to 1, but is {reflect}"));
+            walk.refuse_value(|| format!("`reflect` must be from 0 to 1, but is {reflect}"));
             None
         }
     }

@@ -4,7 +4,7 @@ use glam::DVec3;
 
 use super::{
     block::Block,
-    diagnostic::{Report, shown},
+    diagnostic::{Report, quoted},
     direction::direction,
     field::Field,
     lexer::Word,
@@ -39,8 +39,8 @@ impl<'t> Picture<'t> {
         if let Some(first) = self.opening {
             walk.report.error_with(
                 opening.span(),
-                || "a scene has one `viewport`; this is one more".into(),
-                || Some((first.span(), "the first one".into())),
+                || "a scene has only one `viewport`, but this is another".into(),
+                || Some((first.span(), "the first `viewport` is here".into())),
             );
         }
         walk.enter(Block::Viewport, opening);
@@ -58,7 +58,9 @@ impl<'t> Picture<'t> {
                 b"bottomleft" => &mut bottom_left,
                 b"topright" => &mut top_right,
                 b"screen" => {
-                    walk.warn_synonym(word, "the corners directly in `viewport`");
+                    walk.report.warn(word.span(), || {
+                        "`screen` is not needed: its corners are read as those of `viewport`".into()
+                    });
                     walk.enter(Block::Screen, word);
                     continue;
                 }
@@ -98,7 +100,9 @@ impl<'t> Picture<'t> {
         match word.bytes {
             b"background" => {
                 if !is_at_home {
-                    walk.warn_synonym(word, "`background` in `viewport`");
+                    walk.report.warn(word.span(), || {
+                        "`background` belongs in `viewport`, and is read as if it were there".into()
+                    });
                 }
                 let color = walk.light(word, transfer);
                 self.background.set(&mut walk.report, word, color);
@@ -109,7 +113,8 @@ impl<'t> Picture<'t> {
                 self.read_size(walk, word);
             }
             b"xres" | b"yres" => {
-                walk.warn_synonym(word, "`size` in `viewport`");
+                let which = if word.bytes == b"xres" { "width" } else { "height" };
+                walk.warn_synonym(word, &format!("the {which} in `size`"));
                 let side = walk.number(word).and_then(|number| side(walk, number));
                 let field = if word.bytes == b"xres" { &mut self.width } else { &mut self.height };
                 field.set(&mut walk.report, word, side);
@@ -135,7 +140,7 @@ impl<'t> Picture<'t> {
         {
             if let (Some(word), None) = (set.word, other.word) {
                 report.warn(word.span(), || {
-                    format!("{} without `{name}` is skipped", shown(word.bytes))
+                    format!("{} is ignored, because there is no `{name}`", quoted(word.bytes))
                 });
             }
         }
@@ -152,7 +157,7 @@ fn side(walk: &mut Walk<'_>, side: f64) -> Option<u32> {
     let is_sound = side.fract() == 0.0 && (1.0..=f64::from(Size::MAX_SIDE)).contains(&side);
     if !is_sound {
         walk.refuse_value(|| {
-            format!("a picture's sides are whole numbers from 1 to {}, not {side}", Size::MAX_SIDE)
+            format!("the width and the height of a picture must be whole numbers from 1 to {}, but one is {side}", Size::MAX_SIDE)
         });
     }
     is_sound.then_some(side as u32)
@@ -168,21 +173,24 @@ fn check_viewport(
     let Viewport { eye, top_left, bottom_left, top_right } = *viewport;
     if predicates::is_collinear(top_left, bottom_left, top_right) {
         report
-            .error(corner_word.span(), || "the three corners of the screen are on one line".into());
+            .error(corner_word.span(), || "the three corners of the screen lie on one line".into());
     } else if predicates::is_coplanar(top_left, bottom_left, top_right, eye) {
-        report.error(eye_word.span(), || "the eye, `origin`, is in the plane of the screen".into());
+        report
+            .error(eye_word.span(), || "the eye, `origin`, lies in the plane of the screen".into());
     } else if ![bottom_left - top_left, top_right - top_left, eye - top_left]
         .iter()
         .all(|edge| edge.is_finite())
     {
-        report
-            .error(corner_word.span(), || "this viewport is too large to be computed with".into());
+        report.error(corner_word.span(), || {
+            "this viewport is too large; the longest edge is about 1.8e308".into()
+        });
     } else {
         let (left, top) = (direction(bottom_left - top_left), direction(top_right - top_left));
         let cosine = left.dot(top);
         if cosine.abs() > RIGHT_ANGLE {
             report.warn(corner_word.span(), || {
-                "the screen is no rectangle: its edges at `topleft` are not at a right angle; rendered sheared"
+                "the screen is not a rectangle: its edges at `topleft` are not at a right angle, so the picture \
+                 is sheared"
                     .into()
             });
         }

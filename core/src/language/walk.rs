@@ -4,7 +4,7 @@ use std::ops::Range;
 
 use super::{
     block::{Block, OPENED},
-    diagnostic::{Report, shown},
+    diagnostic::{Report, number_count, quoted},
     lexer::{Lexer, Quotes, Word},
     suggestion::suggestion,
 };
@@ -74,7 +74,7 @@ impl<'t> Walk<'t> {
                     self.report.error(opening.span(), || {
                         format!(
                             "this {} is never closed: `{}` is missing",
-                            shown(opening.bytes),
+                            quoted(opening.bytes),
                             block.end()
                         )
                     });
@@ -100,8 +100,8 @@ impl<'t> Walk<'t> {
                     return None;
                 }
                 self.report.error(word.span(), || {
-                    let ended = shown(ended.word().as_bytes());
-                    format!("no {ended} is open that {} could end", shown(word.bytes))
+                    let ended = ended.word();
+                    format!("{} ends nothing, because no `{ended}` is open", quoted(word.bytes))
                 });
                 continue;
             }
@@ -121,8 +121,8 @@ impl<'t> Walk<'t> {
                 self.lexer.go_to(word.end);
                 self.report.error(word.span(), || {
                     format!(
-                        "{} cannot stand here: it belongs in {}",
-                        shown(word.bytes),
+                        "{} is not allowed here; it belongs in {}",
+                        quoted(word.bytes),
                         opened.home()
                     )
                 });
@@ -131,8 +131,9 @@ impl<'t> Walk<'t> {
             }
             self.lexer.go_to(word.end);
             if word.is_ellipsis() {
-                self.report
-                    .warn(word.span(), || format!("a stray {} is skipped", shown(word.bytes)));
+                self.report.warn(word.span(), || {
+                    format!("{} has no meaning here and is skipped", quoted(word.bytes))
+                });
             } else if word.is_number_like() {
                 self.report_stray_number(&word);
             } else if word.bytes.starts_with(b"end") && word.quotes == Quotes::Bare {
@@ -151,8 +152,15 @@ impl<'t> Walk<'t> {
         if let Some(&(block, opening)) = self.open.last() {
             self.report.error_with(
                 word.span(),
-                || format!("{} cannot end this: `{}` does", shown(word.bytes), block.end()),
-                || Some((opening.span(), "opened here".into())),
+                || {
+                    let found = quoted(word.bytes);
+                    format!(
+                        "{found} cannot end this `{}`; expected `{}`",
+                        block.word(),
+                        block.end()
+                    )
+                },
+                || Some((opening.span(), "the block begins here".into())),
             );
         }
     }
@@ -161,8 +169,8 @@ impl<'t> Walk<'t> {
         if let Some(&(block, opening)) = self.open.last() {
             self.report.error_with(
                 before.span(),
-                || format!("`{}` is missing before {}", block.end(), shown(before.bytes)),
-                || Some((opening.span(), "opened here".into())),
+                || format!("`{}` is missing before {}", block.end(), quoted(before.bytes)),
+                || Some((opening.span(), "the block begins here".into())),
             );
         }
     }
@@ -171,15 +179,15 @@ impl<'t> Walk<'t> {
         let last_field = self.last_field;
         self.report.error(word.span(), || match last_field {
             Some((field, 1)) => {
-                format!("{} takes one number; this is one more", shown(field.bytes))
+                format!("{} takes one number, but a second one follows", quoted(field.bytes))
             }
             Some((field, 0)) => {
-                format!("{} takes a name; a number stands behind it", shown(field.bytes))
+                format!("{} takes a name, but a number follows it", quoted(field.bytes))
             }
             Some((field, count)) => {
-                format!("{} takes {count} numbers; this is one more", shown(field.bytes))
+                format!("{} takes {count} numbers, but one more follows", quoted(field.bytes))
             }
-            None => format!("a keyword should stand here, not {}", shown(word.bytes)),
+            None => format!("expected a keyword, found {}", quoted(word.bytes)),
         });
         while let Some(next) = self.lexer.peek().filter(Word::is_number_like) {
             self.lexer.go_to(next.end);
@@ -198,12 +206,12 @@ impl<'t> Walk<'t> {
             let guess = if closes { Some(end.to_owned()) } else { suggestion(word.bytes, ends) };
             match (guess, is_open) {
                 (Some(guess), _) => {
-                    format!("{} ends no block; did you mean `{guess}`?", shown(word.bytes))
+                    format!("no block ends with {}; did you mean `{guess}`?", quoted(word.bytes))
                 }
                 (None, true) => {
-                    format!("{} ends no block; `{end}` would end this one", shown(word.bytes))
+                    format!("no block ends with {}; expected `{end}`", quoted(word.bytes))
                 }
-                (None, false) => format!("{} ends no block", shown(word.bytes)),
+                (None, false) => format!("no block ends with {}", quoted(word.bytes)),
             }
         });
         if closes {
@@ -218,7 +226,7 @@ impl<'t> Walk<'t> {
         let block = self.innermost();
         if block == Block::Entry && matches!(word.bytes, b"specular" | b"shininess") {
             self.report.warn(word.span(), || {
-                format!("no material here has {}; skipped", shown(word.bytes))
+                format!("materials have no {}, so its line is skipped", quoted(word.bytes))
             });
             self.skip_line();
             return;
@@ -241,41 +249,44 @@ impl<'t> Walk<'t> {
                 (Block::Union | Block::Intersection | Block::Difference, _)
                     if word.bytes == b"material" =>
                 {
-                    "; each of the solids has its own".into()
+                    "; each solid in it has its own".into()
                 }
                 (_, []) => String::new(),
-                (_, [home]) => format!("; it belongs in {home}"),
+                (_, [home]) => format!("; {} belongs in {home}", quoted(word.bytes)),
                 (_, [others @ .., last]) => {
-                    format!("; it belongs in {} or {last}", others.join(", "))
+                    let others = others.join(", ");
+                    format!("; {} belongs in {others} or {last}", quoted(word.bytes))
                 }
             }
         };
         match (block, is_block) {
             (Block::File, false) => self.report.error(word.span(), || match hint() {
                 hint if hint.is_empty() => format!(
-                    "{} begins no section: a file consists of `viewport`, `materials`, `lights` and `geometry`",
-                    shown(word.bytes)
+                    "{} is not a section; the sections are `viewport`, `materials`, `lights` and `geometry`",
+                    quoted(word.bytes)
                 ),
-                hint => format!("{} begins no section{hint}", shown(word.bytes)),
+                hint => format!("{} is not a section{hint}", quoted(word.bytes)),
             }),
             (_, true) => self.report.warn(word.span(), || {
-                format!("the block {} is unknown and skipped{}", shown(word.bytes), hint())
+                format!("the block {} is unknown and is skipped{}", quoted(word.bytes), hint())
             }),
             (_, false) => {
                 let last_field =
                     self.last_field.filter(|(field, _)| self.is_on_one_line(field.end..word.start));
                 self.report.warn(word.span(), || {
-                    let unknown = shown(word.bytes);
+                    let unknown = quoted(word.bytes);
                     match last_field {
                         Some((field, count)) => {
-                            let values = match count {
+                            let (field, values) = (quoted(field.bytes), match count {
                                 0 => "one word".into(),
-                                1 => "one number".into(),
-                                _ => format!("{count} numbers"),
-                            };
-                            format!("{} takes {values}; from {unknown} on the line is skipped", shown(field.bytes))
+                                count => number_count(count),
+                            });
+                            format!("{field} takes {values}; the line is skipped from {unknown} on")
                         }
-                        None => format!("{unknown} is not known in `{}`, and its line is skipped{}", block.word(), hint()),
+                        None => {
+                            let (block, hint) = (block.word(), hint());
+                            format!("`{block}` has no {unknown}, so its line is skipped{hint}")
+                        }
                     }
                 });
             }

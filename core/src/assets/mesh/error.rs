@@ -42,47 +42,57 @@ impl fmt::Display for MeshPlace {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub enum MeshFault {
     /// Neither its bytes nor its name are those of a format.
-    #[error("it is no STL, OBJ or PLY file")]
+    #[error("it is not an STL, OBJ or PLY file")]
     UnknownFormat,
     /// There is nothing to see.
-    #[error("it holds no triangles")]
+    #[error("it has no triangles")]
     Empty,
     /// The file ends too early.
-    #[error("it ends early: {expected} bytes are announced, {found} are there")]
+    #[error("it ends early: its header announces {expected} bytes, but it has {found}")]
     Truncated {
         /// Bytes that should be there.
         expected: u64,
         /// Bytes that are.
         found: u64,
     },
-    /// The text ends too early.
-    #[error("the text ends early")]
-    TextEnd,
+    /// The file ends in the middle of something.
+    #[error("the file ends early")]
+    EarlyEnd,
     /// Something else stands where a finite number should.
-    #[error("a finite number should stand here")]
+    #[error("expected a finite number")]
     Number,
+    /// Something else stands where a whole number should that is not negative.
+    #[error("expected a whole number of 0 or more")]
+    Whole,
+    /// Something else stands where the number of a vertex should.
+    #[error("expected the number of a vertex")]
+    VertexNumber,
     /// An STL facet of other than three vertices.
-    #[error("a facet has 3 vertices, not {0}")]
+    #[error("a facet must have 3 vertices, but this one has {0}")]
     Facet(u64),
     /// A polygon of less than three corners.
-    #[error("a face has 3 corners or more, not {0}")]
+    #[error("a face must have 3 or more corners, but this one has {0}")]
     FewCorners(u64),
     /// A polygon that would take too long to cut up.
-    #[error("a face that is not convex has at most {most} corners", most = polygon::MOST_CORNERS)]
+    #[error("a face that is not convex may have at most {most} corners", most = polygon::MOST_CORNERS)]
     ManyCorners,
     /// An index that no vertex has.
-    #[error("there is no vertex {index}: the file has {count}")]
+    #[error(
+        "there is no vertex {index}; vertices are numbered from {first}, and the file has {count}"
+    )]
     Index {
         /// As the file counts.
         index: i64,
-        /// Vertices that the file has.
+        /// The number of vertices that the file has.
         count: u64,
+        /// The number of the first vertex.
+        first: u8,
     },
     /// More vertices or triangles than indices can tell apart.
     #[error("it has more than {most} vertices or triangles", most = u32::MAX)]
     TooLarge,
     /// A line of a PLY header that cannot be understood.
-    #[error("this line of the header cannot be understood")]
+    #[error("this line is not one of a PLY header")]
     Header,
     /// A PLY file without something that it needs.
     #[error("it has no {0}")]

@@ -55,6 +55,7 @@ pub(super) fn read_obj(text: &[u8]) -> Result<MeshFile, MeshError> {
             let fault = MeshFault::Index {
                 index: line.index_of_corner(start, place),
                 count: vertices.len() as u64,
+                first: 1,
             };
             return Err(fault.at_byte(text, start));
         }
@@ -109,13 +110,14 @@ impl Line<'_> {
                 return Ok(());
             }
             let start = self.at;
-            let index =
-                self.read_index().ok_or_else(|| MeshFault::Number.at_byte(self.text, start))?;
+            let index = self
+                .read_index()
+                .ok_or_else(|| MeshFault::VertexNumber.at_byte(self.text, start))?;
             let from_zero = if index < 0 { count.cast_signed() as i64 + index } else { index - 1 };
             let corner = match usize::try_from(from_zero) {
                 Ok(place) if index != 0 => vertices.get(place).copied().unwrap_or(EARLY),
                 _ => {
-                    let fault = MeshFault::Index { index, count: count as u64 };
+                    let fault = MeshFault::Index { index, count: count as u64, first: 1 };
                     return Err(fault.at_byte(self.text, start));
                 }
             };

@@ -24,7 +24,7 @@ pub(super) fn read_ply(bytes: &[u8]) -> Result<MeshFile, MeshError> {
     }
     let coordinates = [b"x", b"y", b"z"].map(|name| vertex.scalar(name));
     let [Some(_), Some(_), Some(_)] = coordinates else {
-        return Err(MeshFault::Missing("x, y and z of vertices").of_file());
+        return Err(MeshFault::Missing("x, y and z for its vertices").of_file());
     };
     // What the header announces, as far as the file is long enough for it.
     let least_size = vertex.least_size(header.format).max(1);
@@ -93,6 +93,7 @@ fn read_elements<T: Copy + Into<f64>>(
                                     return Err(at(MeshFault::Index {
                                         index,
                                         count: vertex_count,
+                                        first: 0,
                                     }));
                                 }
                                 corners.push(index as u32);
@@ -297,7 +298,7 @@ impl Body<'_> {
                 .saturating_mul(element.least_size(self.format) as u64)
                 .saturating_sub(1);
             if element.properties.is_empty() && element.count > 0 {
-                return Err(MeshFault::Missing("properties").of_file());
+                return Err(MeshFault::Missing("properties for one of its elements").of_file());
             }
             if least > left {
                 let expected = least.saturating_add(self.at as u64);
@@ -314,7 +315,7 @@ impl Body<'_> {
             return self.ascii_number(kind);
         }
         let end = self.at + kind.size();
-        let bytes = self.bytes.get(self.at..end).ok_or(MeshFault::TextEnd)?;
+        let bytes = self.bytes.get(self.at..end).ok_or(MeshFault::EarlyEnd)?;
         self.at = end;
         let is_little = self.format == Format::Little;
         macro_rules! number {
@@ -352,7 +353,7 @@ impl Body<'_> {
         self.skip_space();
         let start = self.at;
         if start == self.bytes.len() {
-            return Err(MeshFault::TextEnd);
+            return Err(MeshFault::EarlyEnd);
         }
         let number = scan_number(self.bytes, &mut self.at).ok_or(MeshFault::Number)?;
         if kind == Number::Float {
@@ -370,7 +371,7 @@ impl Body<'_> {
         if number >= 0.0 && number.fract() == 0.0 && number < 1e15 {
             Ok(number as i64)
         } else {
-            Err(MeshFault::Number)
+            Err(MeshFault::Whole)
         }
     }
 }

@@ -115,7 +115,7 @@ fn read_ascii(text: &[u8]) -> Result<MeshFile, MeshError> {
         }
     }
     if count > 0 {
-        return Err(MeshFault::TextEnd.at_byte(text, text.len()));
+        return Err(MeshFault::EarlyEnd.at_byte(text, text.len()));
     }
     mesh.into_mesh()
 }
