@@ -52,6 +52,13 @@ pub(crate) fn scan_number(text: &[u8], at: &mut usize) -> Option<f64> {
     Some(number)
 }
 
+/// Reads a finite number as [`scan_number`] does, in a text without comments: it ends at white
+/// space or with the text.
+pub(crate) fn scan_number_without_comment(text: &[u8], at: &mut usize) -> Option<f64> {
+    let number = scan_number(text, at)?;
+    text.get(*at).is_none_or(|&byte| class(byte) == Class::Space).then_some(number)
+}
+
 fn is_end(byte: u8) -> bool {
     matches!(class(byte), Class::Space | Class::Comment)
 }

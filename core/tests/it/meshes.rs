@@ -304,6 +304,24 @@ fn broken_ply_is_refused_at_its_place() {
 }
 
 #[test]
+fn a_comment_mark_in_a_number_is_refused_where_the_format_has_no_comments() {
+    let message = "expected a finite number";
+    let body = |from: &str, to: &str| ascii_ply().replacen(from, to, 1);
+    check_error("a.ply", body("0 1 9 0", "0 1.0# 9 0"), &format!("line 16: {message}"));
+    check_error("a.ply", body("0 1 9 0", "0 1 9# 0"), &format!("line 16: {message}"));
+    check_error("a.ply", body("7 3 0 1 2", "7 3# 0 1 2"), &format!("line 19: {message}"));
+    check_error("a.ply", ascii_ply() + "#", &format!("line 22: {message}"));
+    check_error(
+        "a.stl",
+        ascii_stl(&facets()).replacen("5e-1", "5e-1#", 1),
+        "line 13: expected a finite number",
+    );
+    // The manual of OBJ says that comments may stand anywhere.
+    let obj = "v 0 0 0# glued\nv 1 0 0 # apart\nv 0 1 0\n#f 1 2 9\nf 1 2 3#4";
+    assert_eq!(read("a.obj", obj).triangles, [[0, 1, 2]]);
+}
+
+#[test]
 fn counts_take_no_memory_before_they_are_checked() {
     let header = "ply\nformat binary_little_endian 1.0\nelement vertex 4000000000\nproperty double x\nproperty double y\nproperty double z\nend_header\n";
     check_error(

@@ -7,7 +7,7 @@ use super::{
 };
 use crate::text::{
     bytes::{Class, class},
-    number::scan_number,
+    number::scan_number_without_comment,
 };
 
 /// Whether bytes begin as a PLY file does.
@@ -355,7 +355,8 @@ impl Body<'_> {
         if start == self.bytes.len() {
             return Err(MeshFault::EarlyEnd);
         }
-        let number = scan_number(self.bytes, &mut self.at).ok_or(MeshFault::Number)?;
+        let number =
+            scan_number_without_comment(self.bytes, &mut self.at).ok_or(MeshFault::Number)?;
         if kind == Number::Float {
             // Rounded once, from the digits.
             let single: f32 =

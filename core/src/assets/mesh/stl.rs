@@ -6,7 +6,7 @@ use super::{
 };
 use crate::text::{
     bytes::{Class, class},
-    number::scan_number,
+    number::scan_number_without_comment,
 };
 
 /// A header of 80 bytes and the number of triangles.
@@ -91,7 +91,7 @@ fn read_ascii(text: &[u8]) -> Result<MeshFile, MeshError> {
                 let mut position = [0.0; 3];
                 for number in &mut position {
                     at = skip_space(text, at);
-                    *number = scan_number(text, &mut at)
+                    *number = scan_number_without_comment(text, &mut at)
                         .ok_or_else(|| MeshFault::Number.at_byte(text, at))?;
                 }
                 if let Some(corner) = corners.get_mut(count as usize) {
