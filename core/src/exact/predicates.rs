@@ -350,9 +350,10 @@ mod tests {
 
     #[test]
     fn bounds_never_decide_what_whole_numbers_do_not() {
-        let mut state = 3;
+        // Source of the factor: Knuth, "The Art of Computer Programming", MMIX's generator.
+        let mut state = 3_u64;
         let mut random = || {
-            state = crate::exact::hash::mix(state + 1, 0x1234_5678_9abc_def1);
+            state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1);
             (state >> 11) as f64 / 2.0_f64.powi(53) - 0.5
         };
         let (mut flat, mut solid) = (0, 0);

@@ -13,7 +13,7 @@ use super::{
     triangles::{Triangles, hash_vertices},
 };
 use crate::{
-    exact::predicates::is_collinear,
+    exact::{hash::HashFunction, predicates::is_collinear},
     scene::Triangle,
     text::{
         bytes::{Class, class},
@@ -54,18 +54,22 @@ impl Runs {
         if (Scanner { text, at }).triangle().is_none() {
             return at;
         }
-        let (piece, key) = (self.piece, triangles.key);
+        let (piece, function) = (self.piece, triangles.hash_function.clone());
         let threads = rayon::current_num_threads();
         if at < self.parallel_from || threads == 1 {
-            let piece = Piece::parse(text, at, at.saturating_add(piece), key);
+            let piece = Piece::parse(text, at, at.saturating_add(piece), &function);
             return adopt(&[piece], triangles, primitive, symbols);
         }
         let count = PIECES_A_THREAD * threads;
-        let mut window = Window::parse(text, at, piece, count, key);
+        let mut window = Window::parse(text, at, piece, count, &function);
         loop {
             let (adopted, next) = rayon::join(
                 || adopt(&window.pieces, triangles, primitive, symbols),
-                || window.is_whole.then(|| Window::parse(text, window.end, piece, count, key)),
+                || {
+                    window
+                        .is_whole
+                        .then(|| Window::parse(text, window.end, piece, count, &function))
+                },
             );
             if adopted < window.end {
                 // Up to two windows were parsed in vain: read twice as far before trying again.
@@ -138,7 +142,13 @@ struct Window<'t> {
 
 impl<'t> Window<'t> {
     /// Parses up to `count` pieces from byte `at`.
-    fn parse(text: &'t [u8], at: usize, piece: usize, count: usize, key: u64) -> Self {
+    fn parse(
+        text: &'t [u8],
+        at: usize,
+        piece: usize,
+        count: usize,
+        function: &HashFunction,
+    ) -> Self {
         let mut bounds = vec![at];
         let mut end = at;
         while bounds.len() <= count
@@ -154,7 +164,7 @@ impl<'t> Window<'t> {
         }
         let pieces = bounds
             .par_windows(2)
-            .map(|bounds| Piece::parse(text, bounds[0], bounds[1], key))
+            .map(|bounds| Piece::parse(text, bounds[0], bounds[1], function))
             .collect();
         Self { pieces, end, is_whole }
     }
@@ -191,7 +201,7 @@ struct Piece<'t> {
 
 impl<'t> Piece<'t> {
     /// Parses from `start`; no block begins at `end` or behind it.
-    fn parse(text: &'t [u8], start: usize, end: usize, key: u64) -> Self {
+    fn parse(text: &'t [u8], start: usize, end: usize, function: &HashFunction) -> Self {
         let mut piece = Self {
             start,
             stop: start,
@@ -227,7 +237,7 @@ impl<'t> Piece<'t> {
                     material: last_name as u32,
                     primitive: piece.count,
                 });
-                piece.hashes.push(hash_vertices(&vertices, key));
+                piece.hashes.push(hash_vertices(&vertices, function));
             }
             piece.count += 1;
             piece.stop = scanner.at;

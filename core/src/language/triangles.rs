@@ -6,10 +6,7 @@ use glam::{DVec2, DVec3};
 
 use super::symbol::Symbols;
 use crate::{
-    exact::{
-        hash::{mix, random_key, spread},
-        predicates::is_collinear,
-    },
+    exact::{hash::HashFunction, predicates::is_collinear},
     scene::{Dropped, Triangle},
 };
 
@@ -23,9 +20,7 @@ pub(super) struct Triangles {
     pub(super) dropped: Dropped,
     /// Index in `list` and half a hash of each triangle.
     table: HashTable<(u32, u32)>,
-    /// Nobody can write a file whose hashes collide: the key differs from run to run. It has no
-    /// influence on what is kept.
-    pub(super) key: u64,
+    pub(super) hash_function: HashFunction,
 }
 
 impl Triangles {
@@ -36,7 +31,7 @@ impl Triangles {
             texcoords: Vec::new(),
             dropped: Dropped::default(),
             table: HashTable::new(),
-            key: random_key(),
+            hash_function: HashFunction::random(),
         }
     }
 
@@ -54,7 +49,7 @@ impl Triangles {
             self.add_solid(
                 triangle,
                 texcoords,
-                hash_vertices(&triangle.vertices, self.key),
+                hash_vertices(&triangle.vertices, &self.hash_function),
                 symbols,
             );
         }
@@ -68,13 +63,12 @@ impl Triangles {
         vertex_hash: u64,
         symbols: &mut Symbols<'_>,
     ) {
-        let mut hash = mix(vertex_hash, u64::from(triangle.material));
+        let function = &self.hash_function;
+        let mut hash = function.extend(vertex_hash, [u64::from(triangle.material)]);
         if let Some(texcoords) = texcoords {
             let first = first_vertex(&triangle.vertices);
-            for k in 0..3 {
-                let texcoord = texcoords[(first + k) % 3];
-                hash = mix(mix(hash, texcoord.x.to_bits()), texcoord.y.to_bits());
-            }
+            let texcoord = |k: usize| texcoords[(first + k) % 3].to_array().map(f64::to_bits);
+            hash = function.extend(hash, (0..3).flat_map(texcoord));
         }
         let half = (hash >> 32) as u32;
         let (list, known_texcoords) = (&self.list, &self.texcoords);
@@ -135,13 +129,12 @@ fn first_vertex(vertices: &[DVec3; 3]) -> usize {
 }
 
 /// A hash that does not change when the triangle is turned.
-pub(super) fn hash_vertices(vertices: &[DVec3; 3], key: u64) -> u64 {
+pub(super) fn hash_vertices(vertices: &[DVec3; 3], function: &HashFunction) -> u64 {
     let first = first_vertex(vertices);
-    let mut hash = key;
-    for k in 0..3 {
-        for number in vertices[(first + k) % 3].to_array() {
-            hash = mix(hash, number.to_bits());
-        }
-    }
-    hash
+    function.hash((0..3).flat_map(|k| vertices[(first + k) % 3].to_array().map(f64::to_bits)))
+}
+
+/// Half a hash as a whole one: tables take the place from the low bits and a tag from the high.
+fn spread(half: u32) -> u64 {
+    u64::from(half) | u64::from(half) << 32
 }

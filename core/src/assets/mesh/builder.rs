@@ -6,11 +6,7 @@ use glam::DVec3;
 
 use super::error::{MeshError, MeshFault};
 use crate::{
-    exact::{
-        hash::{mix, random_key},
-        polygon,
-        predicates::is_collinear,
-    },
+    exact::{hash::HashFunction, polygon, predicates::is_collinear},
     scene::{Dropped, MeshShape, MeshVertices},
 };
 
@@ -29,7 +25,7 @@ pub(super) struct MeshBuilder<T> {
     vertices: Vec<[T; 3]>,
     vertex_table: HashTable<u32>,
     triangles: Vec<[u32; 3]>,
-    key: u64,
+    hash_function: HashFunction,
     dropped: Dropped,
 }
 
@@ -41,22 +37,20 @@ impl<T: Copy + Into<f64>> MeshBuilder<T> {
             vertices: Vec::with_capacity(vertices),
             vertex_table: HashTable::with_capacity(vertices),
             triangles: Vec::with_capacity(triangles),
-            key: random_key(),
+            hash_function: HashFunction::random(),
             dropped: Dropped::default(),
         }
     }
 
     /// The index of the vertex at a finite position, in which no zero is negative.
     pub(super) fn add_vertex(&mut self, position: [T; 3]) -> Result<u32, MeshFault> {
-        let (vertices, key) = (&self.vertices, self.key);
+        let (vertices, hash_function) = (&self.vertices, &self.hash_function);
         let bits = |position: &[T; 3]| position.map(|number| number.into().to_bits());
         let wanted = bits(&position);
-        let hash = |bits: [u64; 3]| bits.into_iter().fold(key, mix);
         let is_same = |&index: &u32| bits(&vertices[index as usize]) == wanted;
-        match self
-            .vertex_table
-            .entry(hash(wanted), is_same, |&index| hash(bits(&vertices[index as usize])))
-        {
+        match self.vertex_table.entry(hash_function.hash(wanted), is_same, |&index| {
+            hash_function.hash(bits(&vertices[index as usize]))
+        }) {
             Entry::Occupied(known) => Ok(*known.get()),
             Entry::Vacant(place) => {
                 let index = u32::try_from(vertices.len()).map_err(|_| MeshFault::TooLarge)?;
