@@ -55,7 +55,7 @@ const MOST_TEXELS_A_BYTE: u64 = 400;
 /// The memory that a decoder may take besides.
 const MOST_BYTES: u64 = 1 << 30;
 
-/// Decodes the bytes of an image file. They tell the format; of TGA, which has no mark, the name
+/// Decodes the bytes of an image file. They tell the format, except that TGA has no mark: its name
 /// does.
 pub fn read_texture(path: &str, bytes: &[u8]) -> Result<Texture, TextureError> {
     let format = match image::guess_format(bytes) {

@@ -25,7 +25,7 @@ pub(super) enum Block {
     StlModel,
 }
 
-/// All blocks that a word opens, in the order of their numbers less one.
+/// The blocks that a word opens: all but the file.
 pub(super) const OPENED: [Block; 17] = [
     Block::Viewport,
     Block::Screen,
@@ -47,12 +47,12 @@ pub(super) const OPENED: [Block; 17] = [
 ];
 
 impl Block {
-    /// The word that opens it; empty for the file.
+    /// Gives the word that opens it; the file has an empty one.
     pub(super) fn word(self) -> &'static str {
         self.end().strip_prefix("end").unwrap_or("")
     }
 
-    /// The word that ends it; empty for the file.
+    /// Gives the word that ends it; the file has an empty one.
     pub(super) fn end(self) -> &'static str {
         match self {
             Self::File => "",
@@ -76,7 +76,7 @@ impl Block {
         }
     }
 
-    /// The words that may stand in it besides the blocks, synonyms included.
+    /// Lists the words that it may hold besides blocks, synonyms included.
     pub(super) fn fields(self) -> &'static [&'static str] {
         const SCREEN: &[&str] = &[
             "topleft",
@@ -141,8 +141,8 @@ impl Block {
         matches!(self, Self::Union | Self::Intersection | Self::Difference)
     }
 
-    /// Whether it may stand directly in `outer`.
-    pub(super) fn stands_in(self, outer: Self) -> bool {
+    /// Whether `outer` may hold it directly.
+    pub(super) fn is_allowed_in(self, outer: Self) -> bool {
         match self {
             Self::File => false,
             Self::Viewport | Self::Materials | Self::Lights | Self::Geometry => outer == Self::File,
@@ -154,7 +154,7 @@ impl Block {
         }
     }
 
-    /// Where it may stand, for people.
+    /// Names the block that holds it, for messages.
     pub(super) fn home(self) -> &'static str {
         match self {
             Self::File | Self::Viewport | Self::Materials | Self::Lights | Self::Geometry => {
@@ -167,7 +167,7 @@ impl Block {
         }
     }
 
-    /// The block that `word` opens.
+    /// Finds the block that `word` opens.
     pub(super) fn opened_by(word: &Word<'_>) -> Option<Self> {
         let block = match word.bytes {
             b"viewport" => Self::Viewport,
@@ -192,7 +192,7 @@ impl Block {
         (word.quotes == Quotes::Bare).then_some(block)
     }
 
-    /// The block that `word` ends.
+    /// Finds the block that `word` ends.
     pub(super) fn ended_by(word: &Word<'_>) -> Option<Self> {
         Self::opened_by(&Word { bytes: word.bytes.strip_prefix(b"end")?, ..*word })
     }

@@ -58,7 +58,7 @@ pub struct Omitted {
 }
 
 impl Omitted {
-    /// A line for people, or `None` when nothing was left out.
+    /// Makes a line for people, or `None` when nothing was left out.
     pub fn summary(self) -> Option<String> {
         let count = |count: u64, noun: &str| {
             (count > 0).then(|| format!("{count} more {noun}{}", if count == 1 { "" } else { "s" }))
@@ -90,7 +90,7 @@ struct Draft {
 }
 
 impl Report {
-    /// How many errors are kept, and how many warnings.
+    /// The number of errors that are kept, and of warnings.
     pub(super) const KEPT: u64 = 100;
 
     /// Notes that the scene cannot be used.
@@ -136,7 +136,7 @@ impl Report {
         self.error_count == 0
     }
 
-    /// All byte offsets that [`Report::finish`] needs places for.
+    /// Lists the byte offsets that [`Report::finish`] needs places for.
     pub(super) fn offsets(&self) -> impl Iterator<Item = usize> {
         self.kept.iter().flat_map(|draft| {
             [Some(draft.span.start), draft.related.as_ref().map(|(span, _)| span.start)]
@@ -145,7 +145,7 @@ impl Report {
         })
     }
 
-    /// The diagnostics in the order of the text, and how many were not kept.
+    /// Gives the diagnostics in the order of the text, and the number of those that were not kept.
     pub(super) fn finish(mut self, places: &Places) -> (Vec<Diagnostic>, Omitted) {
         self.kept.sort_by_key(|draft| draft.span.start);
         let diagnostics = self
@@ -203,14 +203,14 @@ impl Places {
         Self(places)
     }
 
-    /// The place of an offset that was asked for.
+    /// Gives the place of an offset that was asked for.
     pub(super) fn place(&self, offset: usize) -> Place {
         let index = self.0.binary_search_by_key(&offset, |&(known, _)| known);
         self.0[index.expect("the offset was asked for")].1
     }
 }
 
-/// What some editors put in front of UTF-8.
+/// The bytes that some editors put in front of UTF-8.
 pub(super) const BYTE_ORDER_MARK: &[u8] = b"\xef\xbb\xbf";
 
 /// A count of numbers for a message: `one number`, `3 numbers`.

@@ -2,7 +2,7 @@
 
 use glam::DVec3;
 
-/// A vector of length 1 along `vector`, however long that is.
+/// Gives the vector of length 1 along `vector`, however long that is.
 pub(super) fn direction(vector: DVec3) -> DVec3 {
     let scaled = vector / vector.abs().max_element();
     scaled / scaled.length()

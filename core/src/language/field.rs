@@ -43,7 +43,7 @@ impl<'t, T> Field<'t, T> {
         self.value = value;
     }
 
-    /// The value; it is an error when the field was never set, unless the text is cut off.
+    /// Gives the value, and reports a field that was never set unless the text is cut off.
     pub(super) fn require(self, walk: &mut Walk<'t>, block: Word<'t>, field: &str) -> Option<T> {
         if self.word.is_none() && !walk.is_cut {
             walk.report
@@ -88,7 +88,7 @@ impl<'t> Walk<'t> {
         self.numbers::<1>(field).map(|[number]| number)
     }
 
-    /// How many of the next two words can only be numbers.
+    /// Counts those of the next two words that can only be numbers.
     pub(super) fn numbers_that_follow(&self) -> usize {
         let mut ahead = self.lexer.clone();
         std::iter::from_fn(|| ahead.next()).take(2).take_while(Word::is_number_like).count()
@@ -277,7 +277,7 @@ impl<'t> Walk<'t> {
     }
 }
 
-/// The light of a colour.
+/// Turns a colour into light.
 pub(super) fn decode(color: DVec3, transfer: Transfer) -> DVec3 {
     color.map(|number| transfer.decode(number))
 }

@@ -42,7 +42,8 @@ struct OpenOperation<'t> {
 }
 
 impl<'t> Shapes<'t> {
-    /// None yet. Runs of triangles are parsed in parallel by pieces of about so many bytes.
+    /// Starts without shapes. Runs of triangles are parsed in parallel by pieces of about so many
+    /// bytes.
     pub(super) fn new(piece: usize) -> Self {
         Self {
             runs: Runs::new(piece),
@@ -58,8 +59,8 @@ impl<'t> Shapes<'t> {
         }
     }
 
-    /// Reads a `geometry` block. Operations may be nested a million deep: those that are open form a
-    /// list, not calls.
+    /// Reads a `geometry` block. Operations may be nested a million deep: those that are open form
+    /// a list, not calls.
     pub(super) fn read_geometry(
         &mut self,
         walk: &mut Walk<'t>,
@@ -150,7 +151,7 @@ impl<'t> Shapes<'t> {
         self.solids.push(Solid { nodes, primitive });
     }
 
-    /// The number of a primitive that begins at `word`.
+    /// Counts a primitive that begins at `word`, and gives its number.
     fn next_primitive(&mut self, walk: &mut Walk<'t>, word: Word<'t>) -> u32 {
         let number = u32::try_from(self.primitive);
         if self.primitive == u64::from(u32::MAX) {
@@ -501,7 +502,7 @@ fn read_corners<'t, const N: usize>(
     is_sound.then_some((vertices, texcoords, material))
 }
 
-/// The largest condition number of a parallelepiped: beyond, less than four digits of a hit
+/// The largest condition number of a parallelepiped. Beyond it, fewer than four digits of a hit
 /// would be right.
 const MOST_SHEARED: f64 = 1e12;
 
@@ -514,8 +515,8 @@ fn operation(block: Block) -> Option<Operation> {
     }
 }
 
-/// The condition number (Frobenius) of three edges, each taken as long as the others: how much
-/// more the inverse of a sheared box errs than that of an upright one.
+/// Computes the condition number (Frobenius) of three edges, each taken as long as the others: how
+/// much more the inverse of a sheared box errs than that of an upright one.
 fn condition(edges: [DVec3; 3]) -> f64 {
     let [a, b, c] = edges.map(direction);
     let faces = [b.cross(c), c.cross(a), a.cross(b)];

@@ -15,16 +15,16 @@ pub(super) struct Lexer<'t> {
     at: usize,
 }
 
-/// A word of the text and where it stands.
+/// A word of the text and its place.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Word<'t> {
     /// The word, without its quotes.
     pub(super) bytes: &'t [u8],
     /// Byte offset of its beginning, the opening quote included.
     pub(super) start: usize,
-    /// Byte offset behind it, the closing quote included.
+    /// Byte offset of its end, the closing quote included.
     pub(super) end: usize,
-    /// How it is written.
+    /// The quotes around it.
     pub(super) quotes: Quotes,
 }
 
@@ -40,12 +40,12 @@ pub(super) enum Quotes {
 }
 
 impl Word<'_> {
-    /// Where the word stands, in bytes.
+    /// Gives the bytes of the text that the word takes.
     pub(super) fn span(&self) -> Range<usize> {
         self.start..self.end
     }
 
-    /// The word as text, for messages and paths.
+    /// Gives the word as text, for messages and paths.
     pub(super) fn to_text(self) -> String {
         String::from_utf8_lossy(self.bytes).into_owned()
     }
@@ -66,7 +66,7 @@ impl Word<'_> {
         self.quotes == Quotes::Bare && matches!(self.bytes, b"..." | b"\xe2\x80\xa6")
     }
 
-    /// The word as a finite or infinite number; `None` when it is none or NaN.
+    /// Reads the word as a finite or infinite number; `None` when it is none or NaN.
     pub(super) fn number(&self) -> Option<f64> {
         if self.quotes != Quotes::Bare || self.is_named_infinity_or_nan() {
             return None;
@@ -80,7 +80,7 @@ impl Word<'_> {
     }
 }
 
-/// A number without its sign.
+/// Takes the sign off a number.
 fn unsigned(word: &[u8]) -> &[u8] {
     word.strip_prefix(b"-").or(word.strip_prefix(b"+")).unwrap_or(word)
 }
@@ -95,12 +95,12 @@ impl<'t> Lexer<'t> {
         Self { text, at }
     }
 
-    /// The whole text.
+    /// Gives the whole text.
     pub(super) fn text(&self) -> &'t [u8] {
         self.text
     }
 
-    /// The byte that is looked at next.
+    /// Gives the offset of the byte that is looked at next.
     pub(super) fn at(&self) -> usize {
         self.at
     }
@@ -132,7 +132,7 @@ impl<'t> Lexer<'t> {
         Some(Word { bytes, start, end: self.at, quotes: Quotes::Bare })
     }
 
-    /// The word that [`Lexer::next`] would read.
+    /// Reads the word that [`Lexer::next`] would read, and stays before it.
     pub(super) fn peek(&self) -> Option<Word<'t>> {
         self.clone().next()
     }
@@ -172,7 +172,7 @@ impl<'t> Lexer<'t> {
     }
 }
 
-/// The length of the white space character beyond ASCII that `text` begins with, or 0. A byte
+/// Measures the white space character beyond ASCII that `text` begins with, 0 for none. A byte
 /// order mark counts, since files that begin with one get appended to others.
 fn wide_space_length(text: &[u8]) -> usize {
     match text {

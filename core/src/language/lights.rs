@@ -24,7 +24,7 @@ struct PointLight<'t> {
     position: DVec3,
     power: f64,
     color: DVec3,
-    /// How many references stand before it.
+    /// The number of references before it.
     references_before: usize,
 }
 

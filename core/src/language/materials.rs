@@ -16,7 +16,7 @@ use crate::{scene::Material, transfer::Transfer};
 /// The materials that are known.
 #[derive(Debug, Default)]
 pub(super) struct Materials<'t> {
-    /// In file order; their textures are not known yet.
+    /// The materials in file order; their textures are not known yet.
     pub(super) list: Vec<Material>,
     /// The index of each material that has a texture, and the name of its file.
     pub(super) textures: Vec<(u32, Word<'t>)>,
@@ -143,7 +143,7 @@ impl<'t> Materials<'t> {
     }
 }
 
-/// A colour whose components lie from 0 to 255, as light.
+/// Turns a colour whose components must lie from 0 to 255 into light.
 fn clamp_color(walk: &mut Walk<'_>, parts: [f64; 3], transfer: Transfer) -> DVec3 {
     let clamped = parts.map(|part| part.clamp(0.0, 255.0));
     if parts.iter().any(|part| !(0.0..=255.0).contains(part)) {
@@ -155,7 +155,7 @@ fn clamp_color(walk: &mut Walk<'_>, parts: [f64; 3], transfer: Transfer) -> DVec
     decode(DVec3::from(clamped) / 255.0, transfer)
 }
 
-/// An alpha from 0 to 1.
+/// Brings an alpha into 0 to 1.
 fn clamp_alpha(walk: &mut Walk<'_>, alpha: f64) -> f64 {
     let clamped = alpha.clamp(0.0, 1.0);
     if !(0.0..=1.0).contains(&alpha) {
@@ -166,7 +166,7 @@ fn clamp_alpha(walk: &mut Walk<'_>, alpha: f64) -> f64 {
     clamped
 }
 
-/// The mirrored share, or a percentage of it.
+/// Reads a mirrored share from a share or a percentage.
 fn share(walk: &mut Walk<'_>, reflect: f64) -> Option<f64> {
     match reflect {
         0.0..=1.0 => Some(reflect),

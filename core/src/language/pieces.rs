@@ -1,7 +1,7 @@
-//! Runs of plain triangle blocks. Large scenes are little else, so plain triangle blocks are
-//! parsed by a scanner of their own, pieces of the text in parallel. It gives up at whatever is
-//! not plain and leaves it to the reader of all blocks, so that there is one place that knows
-//! about mistakes, and any number of threads reads the same scene.
+//! Runs of plain triangle blocks: three vertices, a material and nothing else. Large scenes hold
+//! little else, so a scanner of their own parses them, pieces of the text in parallel. It gives up
+//! at whatever is not plain and leaves it to the reader of all blocks, so that there is one place
+//! that knows about mistakes, and any number of threads reads the same scene.
 
 use rayon::prelude::*;
 
@@ -35,7 +35,7 @@ pub(super) struct Runs {
 }
 
 impl Runs {
-    /// Nothing was read yet.
+    /// Starts before the first piece of about `piece` bytes.
     pub(super) fn new(piece: usize) -> Self {
         Self { piece, parallel_from: 0 }
     }
@@ -127,16 +127,16 @@ pub(super) fn skip_plain_triangles(text: &[u8], at: usize) -> usize {
     end
 }
 
-/// Pieces that a thread has to parse before their triangles are taken over.
+/// The pieces that a thread has to parse before their triangles are taken over.
 const PIECES_A_THREAD: usize = 2;
 
 /// Neighbouring pieces of text.
 struct Window<'t> {
-    /// At least one.
+    /// At least one piece.
     pieces: Vec<Piece<'t>>,
-    /// Where the last piece ends if all is plain up to there.
+    /// The end of the last piece, if all is plain up to there.
     end: usize,
-    /// Whether another window may begin at the end.
+    /// Whether another window may begin there.
     is_whole: bool,
 }
 
@@ -170,7 +170,7 @@ impl<'t> Window<'t> {
     }
 }
 
-/// The first `triangle` from byte `from` on that begins a line, within `reach` bytes.
+/// Finds the first `triangle` from byte `from` on that begins a line, within `reach` bytes.
 fn find_triangle_line(text: &[u8], from: usize, reach: usize) -> Option<usize> {
     let end = from.saturating_add(reach).min(text.len());
     memchr::memchr_iter(b'\n', text.get(from..end)?)
@@ -184,23 +184,23 @@ fn find_triangle_line(text: &[u8], from: usize, reach: usize) -> Option<usize> {
         .find(|&start| Scanner { text, at: start }.skip_word(b"triangle").is_some())
 }
 
-/// What a piece of the text holds up to the first thing that is not a plain triangle block.
+/// The contents of a piece of the text, up to the first thing that is not a plain triangle block.
 struct Piece<'t> {
     start: usize,
-    /// Where the next word stands.
+    /// The place of the next word.
     stop: usize,
-    /// Blocks that were read.
+    /// The number of blocks that were read.
     count: u32,
-    /// Those of an area above zero. `material` counts in `names`, `primitive` in the piece.
+    /// The triangles of an area above zero. `material` counts in `names`, `primitive` in the piece.
     triangles: Vec<Triangle>,
-    /// Of their vertices.
+    /// The hashes of their vertices.
     hashes: Vec<u64>,
-    /// First uses of materials, and how many follow.
+    /// The first uses of materials, and the number of all uses.
     names: Vec<(Word<'t>, u32)>,
 }
 
 impl<'t> Piece<'t> {
-    /// Parses from `start`; no block begins at `end` or behind it.
+    /// Parses from `start`; no block begins at `end` or after it.
     fn parse(text: &'t [u8], start: usize, end: usize, function: &HashFunction) -> Self {
         let mut piece = Self {
             start,
@@ -245,7 +245,7 @@ impl<'t> Piece<'t> {
         piece
     }
 
-    /// Names are looked for one by one.
+    /// The most names in a piece: they are searched one by one.
     const MOST_NAMES: usize = 64;
 }
 
@@ -256,7 +256,7 @@ struct Scanner<'t> {
 }
 
 impl<'t> Scanner<'t> {
-    /// Reads a block and the space behind it.
+    /// Reads a block and the space after it.
     fn triangle(&mut self) -> Option<([DVec3; 3], Word<'t>)> {
         self.skip_word(b"triangle")?;
         let vertices = [self.vertex()?, self.vertex()?, self.vertex()?];
@@ -284,14 +284,14 @@ impl<'t> Scanner<'t> {
         self.text.get(self.at).copied().unwrap_or(b' ')
     }
 
-    /// Reads `word` and the space behind it.
+    /// Reads `word` and the space after it.
     fn skip_word(&mut self, word: &[u8]) -> Option<()> {
         self.text[self.at..].starts_with(word).then_some(())?;
         self.at += word.len();
         self.skip_space()
     }
 
-    /// Reads the space behind a word; `None` when the word goes on or the space is unusual.
+    /// Reads the space after a word; `None` when the word goes on or the space is unusual.
     fn skip_space(&mut self) -> Option<()> {
         match class(self.byte()) {
             Class::Word | Class::Wide => return None,
@@ -312,7 +312,7 @@ impl<'t> Scanner<'t> {
         }
     }
 
-    /// Reads a finite number and the space behind it.
+    /// Reads a finite number and the space after it.
     fn number(&mut self) -> Option<f64> {
         let number = scan_number(self.text, &mut self.at)?;
         self.skip_space()?;

@@ -1,6 +1,6 @@
 //! Guesses at misspelt words.
 
-/// The candidate that `word` is most likely a misspelling of.
+/// Finds the candidate of which `word` is most likely a misspelling.
 pub(super) fn suggestion<'a>(
     word: &[u8],
     candidates: impl IntoIterator<Item = &'a str>,

@@ -19,11 +19,11 @@ pub(super) struct Symbol<'t> {
     pub(super) name: &'t [u8],
     /// Index of the material and the word that names it.
     pub(super) definition: Option<(u32, Word<'t>)>,
-    /// Whether the material has a texture, as far as one knows.
+    /// Whether the material has a texture, as far as is known.
     pub(super) is_textured: bool,
     /// The first use.
     pub(super) used: Option<Word<'t>>,
-    /// All uses.
+    /// The number of uses.
     pub(super) use_count: u64,
     /// The first use by something that takes no texture, and what that is.
     pub(super) untexturable: Option<(Word<'t>, &'static str)>,
@@ -32,12 +32,12 @@ pub(super) struct Symbol<'t> {
 }
 
 impl<'t> Symbols<'t> {
-    /// None yet. Those of `textured` names will have textures.
+    /// Starts without names. Materials of `textured` names will have textures.
     pub(super) fn new(textured: &[Vec<u8>]) -> Self {
         Self { textured: textured.to_vec(), ..Self::default() }
     }
 
-    /// The symbol of a name.
+    /// Finds or makes the symbol of a name.
     pub(super) fn symbol(&mut self, name: &'t [u8]) -> u32 {
         *self.by_name.entry(name).or_insert_with(|| {
             self.list.push(Symbol {
@@ -77,7 +77,7 @@ impl<'t> Symbols<'t> {
         &mut self.list[symbol as usize]
     }
 
-    /// All symbols.
+    /// Lists all symbols.
     pub(super) fn iter(&self) -> impl Iterator<Item = &Symbol<'t>> {
         self.list.iter()
     }
@@ -90,7 +90,8 @@ impl<'t> Symbols<'t> {
         !symbol.is_textured
     }
 
-    /// Names for which [`Symbols::may_turn`] gave an answer that a later texture made wrong.
+    /// Lists the names for which [`Symbols::may_turn`] gave an answer that a later texture made
+    /// wrong.
     pub(super) fn textured_after_use(&self) -> Vec<Vec<u8>> {
         self.list
             .iter()

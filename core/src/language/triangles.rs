@@ -7,29 +7,29 @@ use glam::{DVec2, DVec3};
 use super::symbol::Symbols;
 use crate::{
     exact::{hash::HashFunction, predicates::is_collinear},
-    scene::{Dropped, Triangle},
+    scene::{DroppedFaces, Triangle},
 };
 
 /// The triangles that a scene keeps: of an area above zero, each only once.
 #[derive(Debug)]
 pub(super) struct Triangles {
-    /// Their `material` is a symbol.
+    /// The triangles; their `material` is a symbol.
     pub(super) list: Vec<Triangle>,
-    /// By ascending index in `list`.
+    /// Explicit texture coordinates, by ascending index in `list`.
     pub(super) texcoords: Vec<(u32, [DVec2; 3])>,
-    pub(super) dropped: Dropped,
+    pub(super) dropped: DroppedFaces,
     /// Index in `list` and half a hash of each triangle.
     table: HashTable<(u32, u32)>,
     pub(super) hash_function: HashFunction,
 }
 
 impl Triangles {
-    /// None yet.
+    /// Starts without triangles.
     pub(super) fn new() -> Self {
         Self {
             list: Vec::new(),
             texcoords: Vec::new(),
-            dropped: Dropped::default(),
+            dropped: DroppedFaces::default(),
             table: HashTable::new(),
             hash_function: HashFunction::random(),
         }
@@ -115,26 +115,28 @@ fn is_copy(
     }
 }
 
-/// The explicit texture coordinates of a triangle in the list.
+/// Finds the explicit texture coordinates of a triangle in the list.
 fn texcoords_at(texcoords: &[(u32, [DVec2; 3])], index: u32) -> Option<[DVec2; 3]> {
     let place = texcoords.binary_search_by_key(&index, |&(known, _)| known).ok()?;
     Some(texcoords[place].1)
 }
 
-/// The vertex that comes first in an order of all points; turning the triangle does not move it.
+/// Finds the vertex that comes first in an order of all points; turning the triangle does not move
+/// it.
 fn first_vertex(vertices: &[DVec3; 3]) -> usize {
     let key = |k: usize| vertices[k].to_array().map(f64::to_bits);
     let first = usize::from(key(1) < key(0));
     if key(2) < key(first) { 2 } else { first }
 }
 
-/// A hash that does not change when the triangle is turned.
+/// Hashes the vertices of a triangle; turning it does not change the hash.
 pub(super) fn hash_vertices(vertices: &[DVec3; 3], function: &HashFunction) -> u64 {
     let first = first_vertex(vertices);
     function.hash((0..3).flat_map(|k| vertices[(first + k) % 3].to_array().map(f64::to_bits)))
 }
 
-/// Half a hash as a whole one: tables take the place from the low bits and a tag from the high.
+/// Makes a whole hash of half a one: tables take the place from the low bits and a tag from the
+/// high.
 fn spread(half: u32) -> u64 {
     u64::from(half) | u64::from(half) << 32
 }

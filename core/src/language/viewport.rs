@@ -152,7 +152,7 @@ impl<'t> Picture<'t> {
     }
 }
 
-/// A side of the picture in pixels.
+/// Checks a side of the picture, in pixels.
 fn side(walk: &mut Walk<'_>, side: f64) -> Option<u32> {
     let is_sound = side.fract() == 0.0 && (1.0..=f64::from(Size::MAX_SIDE)).contains(&side);
     if !is_sound {

@@ -14,13 +14,13 @@ use super::{
 pub(super) struct Walk<'t> {
     pub(super) lexer: Lexer<'t>,
     pub(super) report: Report,
-    /// Outermost first.
+    /// The open blocks and the words that opened them, the outermost first.
     open: Vec<(Block, Word<'t>)>,
-    /// How many of each kind are open.
+    /// The number of open blocks of each kind.
     open_counts: [usize; 18],
     /// The field that was read last in the innermost block and how many numbers it takes.
     pub(super) last_field: Option<(Word<'t>, usize)>,
-    /// Its value.
+    /// The bytes of that field's value.
     pub(super) value_span: Range<usize>,
     /// Whether the text ended in the middle of a block, so that nobody knows what it lacks.
     pub(super) is_cut: bool,
@@ -51,7 +51,7 @@ impl<'t> Walk<'t> {
         self.last_field = None;
     }
 
-    /// The innermost open block.
+    /// Gives the innermost open block.
     pub(super) fn innermost(&self) -> Block {
         self.open.last().map_or(Block::File, |&(block, _)| block)
     }
@@ -63,7 +63,7 @@ impl<'t> Walk<'t> {
         self.last_field = None;
     }
 
-    /// Reads the next word in the innermost block: a keyword that may stand there, or one that
+    /// Reads the next word in the innermost block: a keyword that it may hold, or a word that
     /// nobody knows. `None` when the block is over.
     pub(super) fn next(&mut self) -> Option<Word<'t>> {
         loop {
@@ -106,13 +106,19 @@ impl<'t> Walk<'t> {
                 continue;
             }
             if let Some(opened) = Block::opened_by(&word) {
-                if opened.stands_in(block) {
+                if opened.is_allowed_in(block) {
                     self.lexer.go_to(word.end);
                     self.last_field = None;
                     return Some(word);
                 }
-                if self.open.iter().rev().skip(1).take(3).any(|&(outer, _)| opened.stands_in(outer))
-                    || (opened.stands_in(Block::File) && block != Block::File)
+                if self
+                    .open
+                    .iter()
+                    .rev()
+                    .skip(1)
+                    .take(3)
+                    .any(|&(outer, _)| opened.is_allowed_in(outer))
+                    || (opened.is_allowed_in(Block::File) && block != Block::File)
                 {
                     self.report_missing_end(&word);
                     self.leave();
@@ -147,7 +153,7 @@ impl<'t> Walk<'t> {
         }
     }
 
-    /// A leaf that is ended by another's word: whoever ends something means what is open.
+    /// Reports a leaf that another block's word ends: whoever ends something means what is open.
     fn report_wrong_end(&mut self, word: &Word<'t>) {
         if let Some(&(block, opening)) = self.open.last() {
             self.report.error_with(
@@ -234,7 +240,7 @@ impl<'t> Walk<'t> {
         let is_block = self.skip_unknown(&word);
         let hint = || {
             let inner =
-                OPENED.iter().filter(|inner| inner.stands_in(block)).map(|inner| inner.word());
+                OPENED.iter().filter(|inner| inner.is_allowed_in(block)).map(|inner| inner.word());
             if let Some(guess) = suggestion(word.bytes, block.fields().iter().copied().chain(inner))
             {
                 return format!("; did you mean `{guess}`?");
@@ -320,7 +326,7 @@ impl<'t> Walk<'t> {
         let block = self.innermost();
         let stops = |word: &Word<'t>| {
             Block::ended_by(word).is_some_and(|ended| self.open_counts[ended as usize] > 0)
-                || Block::opened_by(word).is_some_and(|opened| opened.stands_in(block))
+                || Block::opened_by(word).is_some_and(|opened| opened.is_allowed_in(block))
         };
         let mut ahead = self.lexer.clone();
         let mut end = ahead.at();

@@ -2,7 +2,7 @@
 
 use super::bytes::{Class, class};
 
-/// The number that `word` spells; infinite when it is beyond f64.
+/// Reads the number that `word` spells; it is infinite when it is beyond f64.
 pub(crate) fn parse_number(word: &[u8]) -> Option<f64> {
     let number: f64 = fast_float2::parse(word).ok()?;
     Some(number + 0.0)

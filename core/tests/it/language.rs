@@ -5,7 +5,7 @@ use std::io;
 use glam::{DVec2, DVec3};
 use rtfarm_core::{
     language::{Reading, read_scene},
-    scene::{Dropped, Operation, Scene, SolidNode},
+    scene::{DroppedFaces, Operation, Scene, SolidNode},
     tile::Size,
 };
 
@@ -278,7 +278,7 @@ fn triangles_without_area_and_copies_are_dropped() {
         .map(triangle)
         .concat()
     ));
-    assert_eq!(scene.dropped, Dropped { zero_area: 2, duplicates: 2 });
+    assert_eq!(scene.dropped, DroppedFaces { zero_area: 2, duplicates: 2 });
     assert_eq!(scene.triangles.iter().map(|t| t.primitive).collect::<Vec<_>>(), [0, 2, 3, 6, 7, 9]);
     assert_eq!(scene.triangle_texcoords.iter().map(|t| t.0).collect::<Vec<_>>(), [4, 5]);
 }

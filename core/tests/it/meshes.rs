@@ -4,12 +4,12 @@ use std::fmt::Write;
 
 use rtfarm_core::{
     assets::mesh::{MeshFault, read_mesh},
-    scene::{Dropped, MeshShape, MeshVertices},
+    scene::{DroppedFaces, MeshShape, MeshVertices},
 };
 
 fn read(path: &str, bytes: impl AsRef<[u8]>) -> MeshShape {
     let file = read_mesh(path, bytes.as_ref()).unwrap_or_else(|error| panic!("{path}: {error}"));
-    assert_eq!(file.dropped, Dropped::default());
+    assert_eq!(file.dropped, DroppedFaces::default());
     file.shape
 }
 
@@ -158,7 +158,7 @@ fn equal_vertices_and_copies_become_one() {
     let text = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 -0\nv 1 0 0\nf 1 2 3\nf 2 3 4\nf 3 2 1\nf 1 2 5\nf 1 2 3 3";
     let file = read_mesh("a.obj", text.as_bytes()).unwrap();
     assert_eq!(file.shape.triangles, [[0, 1, 2], [2, 1, 0]]);
-    assert_eq!(file.dropped, Dropped { zero_area: 2, duplicates: 2 });
+    assert_eq!(file.dropped, DroppedFaces { zero_area: 2, duplicates: 2 });
 }
 
 #[test]

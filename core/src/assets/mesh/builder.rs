@@ -7,7 +7,7 @@ use glam::DVec3;
 use super::error::{MeshError, MeshFault};
 use crate::{
     exact::{hash::HashFunction, polygon, predicates::is_collinear},
-    scene::{Dropped, MeshShape, MeshVertices},
+    scene::{DroppedFaces, MeshShape, MeshVertices},
 };
 
 /// What a mesh file gave.
@@ -16,7 +16,7 @@ pub struct MeshFile {
     /// Its faces.
     pub shape: MeshShape,
     /// Faces that were left out.
-    pub dropped: Dropped,
+    pub dropped: DroppedFaces,
 }
 
 /// A mesh that grows: equal vertices become one, triangles without area and copies are dropped.
@@ -26,23 +26,24 @@ pub(super) struct MeshBuilder<T> {
     vertex_table: HashTable<u32>,
     triangles: Vec<[u32; 3]>,
     hash_function: HashFunction,
-    dropped: Dropped,
+    dropped: DroppedFaces,
 }
 
 impl<T: Copy + Into<f64>> MeshBuilder<T> {
-    /// Nothing yet. It may grow to the given sizes without moving; they must not be taken from a
-    /// file without a check.
+    /// Starts an empty mesh. It may grow to the given sizes without moving; they must not be taken
+    /// from a file without a check.
     pub(super) fn with_capacity(vertices: usize, triangles: usize) -> Self {
         Self {
             vertices: Vec::with_capacity(vertices),
             vertex_table: HashTable::with_capacity(vertices),
             triangles: Vec::with_capacity(triangles),
             hash_function: HashFunction::random(),
-            dropped: Dropped::default(),
+            dropped: DroppedFaces::default(),
         }
     }
 
-    /// The index of the vertex at a finite position, in which no zero is negative.
+    /// Finds or adds the vertex at a finite position, in which no zero is negative, and gives its
+    /// index.
     pub(super) fn add_vertex(&mut self, position: [T; 3]) -> Result<u32, MeshFault> {
         let (vertices, hash_function) = (&self.vertices, &self.hash_function);
         let bits = |position: &[T; 3]| position.map(|number| number.into().to_bits());
@@ -96,8 +97,8 @@ impl<T: Copy + Into<f64>> MeshBuilder<T> {
         DVec3::from(self.vertices[index as usize].map(Into::into))
     }
 
-    /// Drops every triangle that stands there already. Only those of one smallest corner can be
-    /// equal, and those are few and near each other: this costs less than a table of all.
+    /// Drops every copy of an earlier triangle. Only triangles of one smallest corner can be equal,
+    /// and those are few and near each other: this costs less than a table of all.
     fn drop_copies(&mut self) {
         let triangles = &self.triangles;
         // How many triangles have each smallest corner, then where those begin in `order`.
@@ -159,14 +160,14 @@ impl<T: Copy + Into<f64>> MeshBuilder<T> {
 }
 
 impl MeshBuilder<f32> {
-    /// The mesh, unless it is empty.
+    /// Finishes the mesh, which must not be empty.
     pub(super) fn into_mesh(self) -> Result<MeshFile, MeshError> {
         self.finish(MeshVertices::Single)
     }
 }
 
 impl MeshBuilder<f64> {
-    /// The mesh, unless it is empty.
+    /// Finishes the mesh, which must not be empty.
     pub(super) fn into_mesh(self) -> Result<MeshFile, MeshError> {
         self.finish(|vertices| {
             let is_single = |&number: &f64| f64::from(number as f32).to_bits() == number.to_bits();
@@ -181,7 +182,7 @@ impl MeshBuilder<f64> {
     }
 }
 
-/// A triangle that begins with its smallest index.
+/// Turns a triangle so that it begins with its smallest index.
 fn turned([a, b, c]: [u32; 3]) -> [u32; 3] {
     if a <= b && a <= c {
         [a, b, c]

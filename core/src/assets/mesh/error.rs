@@ -100,13 +100,13 @@ pub enum MeshFault {
 }
 
 impl MeshFault {
-    /// The fault at a byte of a text.
+    /// Says that the fault is at a byte of a text.
     pub(super) fn at_byte(self, text: &[u8], at: usize) -> MeshError {
         let line = 1 + memchr::memchr_iter(b'\n', &text[..at.min(text.len())]).count();
         MeshError { at: MeshPlace::Line(line), fault: self }
     }
 
-    /// The fault of the file as a whole.
+    /// Says that the fault is the whole file's.
     pub(super) fn of_file(self) -> MeshError {
         MeshError { at: MeshPlace::File, fault: self }
     }

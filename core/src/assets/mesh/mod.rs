@@ -1,8 +1,7 @@
 //! Mesh files into shared vertices and triangles.
 //!
-//! The readers of the three formats are the project's own. Those that the package registry has
-//! allocate for every line or property, trust the counts of the file, or keep vertices apart that
-//! are equal.
+//! The readers of the three formats are written by hand, since those of the package registry
+//! allocate for every line or property, trust the counts of the file, or keep equal vertices apart.
 
 mod builder;
 mod error;
@@ -15,7 +14,8 @@ pub use self::{
     error::{MeshError, MeshFault, MeshPlace},
 };
 
-/// Reads the bytes of a mesh file. They tell the format; of OBJ, which has no mark, the name does.
+/// Reads the bytes of a mesh file. They tell the format, except that OBJ has no mark: its name
+/// does.
 pub fn read_mesh(path: &str, bytes: &[u8]) -> Result<MeshFile, MeshError> {
     let extension = path.rsplit_once('.').map(|(_, extension)| extension.to_ascii_lowercase());
     match extension.as_deref() {

@@ -64,14 +64,14 @@ pub(super) fn read_obj(text: &[u8]) -> Result<MeshFile, MeshError> {
     mesh.into_mesh()
 }
 
-/// Stands for a vertex that is not there yet.
+/// The index of a vertex that is not there yet.
 const EARLY: u32 = u32::MAX;
 
 fn is_blank(byte: u8) -> bool {
     matches!(byte, b' ' | b'\t' | b'\\')
 }
 
-/// Reads along a line, which may go on behind a backslash.
+/// Reads along a line, which goes on after a backslash.
 struct Line<'t> {
     text: &'t [u8],
     at: usize,
@@ -95,8 +95,8 @@ impl Line<'_> {
         self.at += memchr::memchr(b'\n', rest).map_or(rest.len(), |end| end + 1);
     }
 
-    /// Reads the corners of a face. `count` vertices stand before it; negative numbers count
-    /// back from those.
+    /// Reads the corners of a face that follows `count` vertices; negative numbers count back from
+    /// those.
     fn read_corners(
         &mut self,
         vertices: &[u32],
@@ -145,7 +145,7 @@ impl Line<'_> {
         (is_number && is_over).then_some(if is_negative { -index } else { index })
     }
 
-    /// The number of a corner in a face that was read once without a mistake.
+    /// Gives the number of a corner in a face that was read once without a mistake.
     fn index_of_corner(&self, start: usize, place: usize) -> i64 {
         let mut line = Line { text: self.text, at: start };
         let mut index = 0;

@@ -132,7 +132,7 @@ fn read_elements<T: Copy + Into<f64>>(
     Ok(mesh)
 }
 
-/// How the body is written.
+/// The form of the body.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Format {
     Ascii,
@@ -178,7 +178,7 @@ impl Number {
     }
 }
 
-/// What stands before the body.
+/// The lines before the body.
 struct Header<'t> {
     format: Format,
     elements: Vec<Element<'t>>,
@@ -206,7 +206,7 @@ impl Property<'_> {
 }
 
 impl Element<'_> {
-    /// Place and type of the number called `name`.
+    /// Finds the place and the type of the number called `name`.
     fn scalar(&self, name: &[u8]) -> Option<(usize, Number)> {
         let place = self
             .properties
@@ -215,7 +215,7 @@ impl Element<'_> {
         Some((place, self.properties[place].kind))
     }
 
-    /// The least bytes that one takes.
+    /// Counts the least bytes that one takes.
     fn least_size(&self, format: Format) -> usize {
         let size = |property: &Property<'_>| match format {
             Format::Ascii => 2,
@@ -288,11 +288,11 @@ struct Body<'t> {
 }
 
 impl Body<'_> {
-    /// Whether elements from `index` on can still be there, now and then.
+    /// Checks before the first element that the file is long enough for all.
     fn check_left(&self, element: &Element<'_>, index: u64) -> Result<(), MeshError> {
         if index == 0 {
             let left = (self.bytes.len() - self.at) as u64;
-            // The last number of a text needs no space behind it.
+            // The last number of a text needs no space after it.
             let least = element
                 .count
                 .saturating_mul(element.least_size(self.format) as u64)
