@@ -19,6 +19,7 @@ use rtfarm_core::{
     scene::{Scene, Viewport},
     tile::{Area, Size},
 };
+use rtfarm_oracle::hard_case::HardCase;
 
 const FACES: usize = 100_000;
 const ROUNDS: usize = 9;
@@ -27,13 +28,19 @@ fn main() {
     let plain = tilted(0.0);
     let denormal = tilted(1e-310);
     let ratio = ratio_of_medians(|| picture(&denormal), || picture(&plain));
-    println!("case 24: denormal coordinates and directions, time over that of zeros: {ratio:.2}");
+    let row = HardCase::Denormal.row();
+    println!(
+        "case {row}: denormal coordinates and directions, time over that of zeros: {ratio:.2}"
+    );
 
     let normal = bottle(FACES);
     let coincident = coincident();
     let build = |scene: &Scene| drop(prepare(scene).expect("a plain scene"));
     let ratio = ratio_of_medians(|| build(&coincident), || build(&normal));
-    println!("case 28: preparing 1e5 coincident triangles, time over that of a mesh: {ratio:.2}");
+    let row = HardCase::ManyFacesInOnePlace.row();
+    println!(
+        "case {row}: preparing 1e5 coincident triangles, time over that of a mesh: {ratio:.2}"
+    );
 }
 
 /// Seconds of one over seconds of the other: medians of runs in turns.

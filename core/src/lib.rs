@@ -30,7 +30,3 @@ pub mod trace;
 
 pub use assets::{mesh as mesh_file, texture};
 pub use language::reader as read;
-
-#[cfg(test)]
-#[path = "../tests/long/mod.rs"]
-mod long;

@@ -1,14 +1,10 @@
 //! Image files of all formats against the texels that they give, and textured faces against what
 //! is to be seen of them.
 
-mod long;
-mod studio;
-
 use std::{fs, io::Cursor, ops::ControlFlow, path::Path};
 
 use glam::DVec2;
 use image::{DynamicImage, ImageFormat, RgbImage, RgbaImage};
-use long::tell;
 use rtfarm_core::{
     isa::Isa,
     read::read_scene,
@@ -20,12 +16,14 @@ use rtfarm_core::{
 };
 use rtfarm_oracle::{
     Settings as OracleSettings, eye_direction,
+    hard_case::HardCase,
     known_pictures::checkerboard,
     random::Random,
     random_scene::{Recipe, Style, random_scene},
     reference_picture,
 };
-use studio::{picture, pixels, prepared, quality, settings, whole};
+
+use crate::support::studio::{self, picture, pixels, prepared, quality, settings, whole};
 
 const TEXELS: [[u8; 3]; 6] =
     [[255, 0, 0], [0, 255, 0], [0, 0, 255], [1, 2, 3], [128, 64, 32], [250, 251, 252]];
@@ -379,8 +377,7 @@ fn a_footprint_of_ten_thousand_to_one_keeps_the_mean() {
         assert!(off < 1e-6, "{:?}: off by {off:e}", image.dimensions());
         worst_off = worst_off.max(off);
     }
-    tell(
-        64,
+    HardCase::AwkwardTextures.tell(
         "images of 1 x 1 to 200 x 3 and 3 x 1000 texels, seen at 1e4 to 1, keep their mean",
         format!("off by {worst_off:.1e} at most"),
     );

@@ -1,8 +1,5 @@
 //! The tracer against the oracle, against brute force and against itself on other instructions.
 
-mod judge;
-
-use judge::check_against_oracle;
 use rtfarm_core::{
     isa::Isa,
     prepare::prepare,
@@ -15,6 +12,8 @@ use rtfarm_oracle::{
     random::Random,
     random_scene::{Aim, Recipe, Style, random_ray, random_scene},
 };
+
+use crate::support::judge::check_against_oracle;
 
 const STYLES: [Style; 4] = [Style::Plain, Style::Grid, Style::Extreme, Style::Far];
 

@@ -1,14 +1,9 @@
 //! Light that faces send on to others, against closed forms and the oracle's sums over the sky.
 //! Every test prints how far off it is.
 
-mod parts;
-#[expect(dead_code, reason = "other tests need the rest")]
-mod studio;
-
 use std::{fmt::Write, ops::ControlFlow};
 
 use glam::DVec3;
-use parts::{join, sphere, upright};
 use rayon::prelude::*;
 use rtfarm_core::{
     isa::Isa,
@@ -25,7 +20,11 @@ use rtfarm_oracle::{
     random::Random,
     reference_picture,
 };
-use studio::{prepared, read, whole};
+
+use crate::support::{
+    parts::{join, sphere, upright},
+    studio::{prepared, read, whole},
+};
 
 /// The materials of these scenes: what receives, and what sends on 0.4 of what it receives.
 const MATERIALS: &str = "entry name matte endentry entry name shiny reflect 0.4 endentry ";

@@ -4,7 +4,7 @@ use std::{fs, path::Path};
 
 use rtfarm_oracle::random::Random;
 
-#[path = "../../fuzz/targets.rs"]
+#[path = "../../../fuzz/targets.rs"]
 mod targets;
 
 fn check_corpus(name: &str, target: fn(&[u8])) {

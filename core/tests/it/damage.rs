@@ -1,14 +1,9 @@
 //! Prepared scenes whose bytes nobody wrote, under a hash that fits: each is refused, or shows a
 //! picture of finite light; no damage leads to a panic or an endless walk.
 
-mod parts;
-#[expect(dead_code, reason = "other tests need the rest")]
-mod studio;
-
 use std::ops::ControlFlow;
 
 use glam::DVec3;
-use parts::{join, sphere, upright};
 use rayon::prelude::*;
 use rtfarm_core::{
     isa::Isa,
@@ -18,7 +13,11 @@ use rtfarm_core::{
     scene::{Scene, Texture},
     tile::Size,
 };
-use studio::{read, whole};
+
+use crate::support::{
+    parts::{join, sphere, upright},
+    studio::{read, whole},
+};
 
 /// Where the table of sections begins, behind the hash of all that follows it.
 const TABLE: usize = 8 + 4 + 4 + 32;

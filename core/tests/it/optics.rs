@@ -2,24 +2,26 @@
 
 #![expect(clippy::float_cmp, reason = "what holds exactly is tested exactly")]
 
-mod long;
-mod parts;
-mod studio;
-
 use std::{fmt::Write, ops::ControlFlow, sync::Arc};
 
 use glam::DVec3;
-use long::{few_rays, random, rays, tell};
-use parts::{join, sphere, upright};
 use rtfarm_core::{
     isa::Isa,
     render::{RenderedTile, render_tile},
     scene::{Mesh, MeshShape, MeshVertices, Scene},
 };
 use rtfarm_oracle::{
-    Settings as OracleSettings, closed_forms::irradiance, eye_direction, reference_picture,
+    Settings as OracleSettings,
+    closed_forms::irradiance,
+    eye_direction,
+    hard_case::{HardCase, few_rays, random, rays},
+    reference_picture,
 };
-use studio::{picture, pixels, prepared, read, settings, whole};
+
+use crate::support::{
+    parts::{join, sphere, upright},
+    studio::{picture, pixels, prepared, read, settings, whole},
+};
 
 /// A screen of 2 x 2 at z = 2.5, seen from z = 5.
 const VIEWPORT: &str = "viewport origin 0 0 5 topleft -1 1 2.5 bottomleft -1 -1 2.5
@@ -79,7 +81,8 @@ fn parallel_mirrors_add_up_a_geometric_series_and_report_the_rest() {
             assert!(error < 1e-7, "{share}: {pixel:?}, truly {}", 1.0 - rest);
         }
     }
-    tell(54, "parallel mirrors add up a geometric series", "right within a rounding");
+    HardCase::ParallelMirrors
+        .tell("parallel mirrors add up a geometric series", "right within a rounding");
 }
 
 #[test]
@@ -152,7 +155,7 @@ fn a_ratio_of_one_bends_nothing_to_the_bit() {
         rendered(&scene(&glass, "ambient 0.5 point coords 3 3 4 power 9 endpoint", &things), side())
     };
     assert!(with("refract 1") == with("") && with("refract 0") == with(""));
-    tell(53, "a ratio of 1 bends nothing to the bit", "no wrong pixel");
+    HardCase::RatioOfOne.tell("a ratio of 1 bends nothing to the bit", "no wrong pixel");
 }
 
 #[test]
@@ -354,8 +357,7 @@ fn slabs_nested_and_overlapping_bend_at_each_face_by_its_own_ratio_and_side() {
         assert!(asked > rays(4_000), "{what}: {asked} rays arrive");
         (count, worst) = (count + asked, worst.max(error));
     }
-    tell(
-        50,
+    HardCase::NestedGlass.tell(
         "nested and overlapping slabs bend at each face",
         format!("{count} rays, right within {worst:.1e} of the light"),
     );
@@ -654,8 +656,7 @@ fn light_that_never_gets_out_adds_up_a_geometric_series_and_no_more() {
             count += tile.pixels.len();
         }
     }
-    tell(
-        52,
+    HardCase::TotalReflection.tell(
         "light that never gets out is no more than there is",
         format!("{count} rays; what stays in is right within {worst:.1e}"),
     );
@@ -743,7 +744,8 @@ fn no_ray_goes_below_a_mirror_that_it_grazes() {
             count += check_grazed("a ball", &scene, side_of(2_000));
         }
     }
-    tell(55, "no ray goes below a mirror that it grazes at 89.9999°", format!("0 of {count}"));
+    HardCase::GrazedMirror
+        .tell("no ray goes below a mirror that it grazes at 89.9999°", format!("0 of {count}"));
 }
 
 /// The picture is the oracle's; tells how many pixels differ.
@@ -804,7 +806,10 @@ fn an_eye_inside_glass_or_a_solid_sees_what_the_oracle_sees() {
         assert!(differing * 500 <= (side * side) as usize, "{what}: {differing} pixels differ");
         count += side * side;
     }
-    tell(49, "an eye inside glass or a solid sees what the oracle sees", format!("{count} pixels"));
+    HardCase::EyeInside.tell(
+        "an eye inside glass or a solid sees what the oracle sees",
+        format!("{count} pixels"),
+    );
 }
 
 #[test]
@@ -847,8 +852,7 @@ fn at_the_critical_angle_light_turns_back_once_and_stays_a_number() {
         worst = worst.max(angle_error);
         count += seen.len();
     }
-    tell(
-        51,
+    HardCase::CriticalAngle.tell(
         "at the critical angle light turns back once and stays a number",
         format!("{count} rays; windows from 1e-3 down turn at the angle within {worst:.1e}"),
     );

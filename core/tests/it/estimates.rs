@@ -3,9 +3,6 @@
 
 #![expect(clippy::disallowed_methods, reason = "slopes of errors reach no pixel")]
 
-#[allow(dead_code, reason = "rendering needs little of it")]
-mod studio;
-
 use std::{fmt::Write, ops::ControlFlow};
 
 use rtfarm_core::{
@@ -15,7 +12,8 @@ use rtfarm_core::{
     tile::Size,
 };
 use rtfarm_oracle::known_pictures::{KnownPicture, known_pictures};
-use studio::{prepared, read, whole};
+
+use crate::support::studio::{prepared, read, whole};
 
 const SEEDS: u64 = 16;
 

@@ -1,9 +1,6 @@
 //! Pictures of scenes whose colours are encoded by the sRGB curve: what stands there unmixed looks
 //! as it is written, and what mixes does so as light.
 
-#[expect(dead_code, reason = "other tests need the rest")]
-mod studio;
-
 use std::io::Cursor;
 
 use image::{DynamicImage, ImageFormat, RgbImage};
@@ -14,7 +11,8 @@ use rtfarm_core::{
     scene::Scene,
     transfer::Transfer,
 };
-use studio::{picture, settings, whole};
+
+use crate::support::studio::{self, picture, settings, whole};
 
 const BOTH: [Transfer; 2] = [Transfer::None, Transfer::Srgb];
 

@@ -1,10 +1,7 @@
 //! Closed surfaces let no ray through at their edges and corners, wherever they stand and however
 //! large they are.
 
-mod long;
-
 use glam::DVec3;
-use long::{few_rays, random, rays, tell};
 use rayon::prelude::*;
 use rtfarm_core::{
     isa::Isa,
@@ -15,6 +12,7 @@ use rtfarm_core::{
 };
 use rtfarm_oracle::{
     Oracle,
+    hard_case::{HardCase, few_rays, random, rays},
     random::Random,
     random_scene::{Recipe, Style, random_scene},
 };
@@ -175,10 +173,10 @@ fn leaks(surface: &Surface, scale: f64, is_corner: bool, count: usize, stream: u
 type Make = fn((f64, f64)) -> Surface;
 
 /// At edges or at corners of every kind of surface in every place.
-fn check_no_leaks(case: u32, what: &str, is_corner: bool, kinds: &[(&str, Make)]) {
+fn check_no_leaks(case: HardCase, what: &str, is_corner: bool, kinds: &[(&str, Make)]) {
     let runs = kinds.len() * PLACES.len();
     let each = rays(500_000) / runs;
-    let mut stream = u64::from(case) * 100;
+    let mut stream = u64::from(case.row()) * 100;
     for (kind, make) in kinds {
         for place in PLACES {
             stream += 1;
@@ -186,7 +184,7 @@ fn check_no_leaks(case: u32, what: &str, is_corner: bool, kinds: &[(&str, Make)]
             assert_eq!(leaks, 0, "{kind}, moved by {}, scaled by {}", place.0, place.1);
         }
     }
-    tell(case, what, format!("0 leaks of {} rays", each * runs));
+    case.tell(what, format!("0 leaks of {} rays", each * runs));
 }
 
 const KINDS: [(&str, Make); 4] = [
@@ -198,18 +196,28 @@ const KINDS: [(&str, Make); 4] = [
 
 #[test]
 fn closed_surfaces_have_no_leaks_at_their_edges() {
-    check_no_leaks(1, "no ray gets through at an edge, with every instruction set", false, &KINDS);
+    check_no_leaks(
+        HardCase::SharedEdge,
+        "no ray gets through at an edge, with every instruction set",
+        false,
+        &KINDS,
+    );
 }
 
 #[test]
 fn closed_surfaces_have_no_leaks_at_their_corners() {
-    check_no_leaks(2, "no ray gets through at a corner, with every instruction set", true, &KINDS);
+    check_no_leaks(
+        HardCase::SharedVertex,
+        "no ray gets through at a corner, with every instruction set",
+        true,
+        &KINDS,
+    );
 }
 
 #[test]
 fn surfaces_of_triangles_and_quadrangles_have_no_leaks_where_they_join() {
     let what = "no ray gets through where quadrangles and triangles join";
-    check_no_leaks(38, what, false, &KINDS[1..3]);
+    check_no_leaks(HardCase::MixedSharedEdge, what, false, &KINDS[1..3]);
 }
 
 #[test]
@@ -249,8 +257,7 @@ fn closed_surfaces_are_crossed_as_often_as_the_oracle_counts() {
         same += results.iter().filter(|&&is_same| is_same).count();
         close += results.iter().filter(|&&is_same| !is_same).count();
     }
-    tell(
-        3,
+    HardCase::CountedTwice.tell(
         "closed surfaces are crossed an even number of times, as often as the oracle counts",
         format!("{same} rays; {close} more graze an edge within rounding"),
     );

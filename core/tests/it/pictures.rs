@@ -1,13 +1,9 @@
 //! Whole pictures: the tracer's against the oracle's, against closed forms, against its own when
 //! the picture is cut, the scene scaled, moved or turned.
 
-mod long;
-mod studio;
-
 use std::{fs, path::Path};
 
 use glam::{DVec2, DVec3};
-use long::tell;
 use rtfarm_core::{
     prepared::{PreparedBytes, PreparedScene},
     read::read_scene,
@@ -20,11 +16,13 @@ use rtfarm_oracle::{
     Oracle, Settings as OracleSettings,
     closed_forms::{irradiance, polygon_coverage, polygon_outline, sphere_outline},
     eye_direction,
+    hard_case::HardCase,
     random::Random,
     random_scene::{Recipe, Style, random_scene},
     reference_picture,
 };
-use studio::{picture, pixels, prepared, quality, read, settings, whole};
+
+use crate::support::studio::{picture, pixels, prepared, quality, read, settings, whole};
 
 /// The channels are rounded to f32 once, at the end; 1.0 is what a scene writes as 255.
 const ROUNDING: f64 = 1e-6;
@@ -389,7 +387,8 @@ fn a_scaled_scene_gives_the_same_picture_to_the_bit() {
             assert!(bits(&picture(&scaled, &settings)) == picture_bits, "{style:?} 2^{exponent}");
         }
     }
-    tell(6, "a scene scaled by 2^-40 to 2^40 gives the same picture to the bit", "12 pictures");
+    HardCase::ScaledByPowersOfTwo
+        .tell("a scene scaled by 2^-40 to 2^40 gives the same picture to the bit", "12 pictures");
 }
 
 /// Two pictures differ by more than one step of eight bits in at most 1 of 10,000 pixels.
@@ -410,7 +409,7 @@ fn a_scene_moved_by_a_million_looks_the_same() {
     let moved = transformed(&scene, |point| point + offset, 1.0);
     let differing = check_alike("moved", &settings(160, 120, 4), &scene, &moved);
     let measured = format!("{differing} of {} pixels differ by more than 1/255", 160 * 120);
-    tell(5, "a scene moved by 1e6 looks the same", measured);
+    HardCase::FarScene.tell("a scene moved by 1e6 looks the same", measured);
 }
 
 #[test]

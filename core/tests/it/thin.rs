@@ -1,9 +1,6 @@
 //! Whatever 64 samples of every pixel show is in the adaptive picture too, however thin it is.
 //! Polygons seen straight on have closed forms: their area on the screen.
 
-#[allow(dead_code, reason = "rendering needs little of it")]
-mod studio;
-
 use std::{fmt::Write, ops::ControlFlow};
 
 use rtfarm_core::{
@@ -12,7 +9,8 @@ use rtfarm_core::{
     render::{Quality, RenderedTile, Sampling, Settings, render_tile},
     tile::{Area, Size},
 };
-use studio::{prepared, read, whole};
+
+use crate::support::studio::{prepared, read, whole};
 
 /// The screen of all scenes here, at z = 0, seen from z = 5: 96 x 72 pixels of this side.
 const PIXEL: f64 = 4.0 / 96.0;

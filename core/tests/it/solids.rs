@@ -2,16 +2,9 @@
 //!
 //! `RTFARM_RAYS=100` takes a hundred times as many rays.
 
-mod judge;
-mod long;
-mod parts;
-
 use std::{f64::consts::PI, thread};
 
 use glam::{DMat3, DVec3};
-use judge::check_against_oracle;
-use long::{few_rays, random, rays, tell};
-use parts::{join, parallelepiped, sphere, upright};
 use rayon::prelude::*;
 use rtfarm_core::{
     isa::Isa,
@@ -23,8 +16,14 @@ use rtfarm_core::{
 };
 use rtfarm_oracle::{
     Oracle,
+    hard_case::{HardCase, few_rays, random, rays},
     random::Random,
     random_scene::{Recipe, Style, random_scene},
+};
+
+use crate::support::{
+    judge::check_against_oracle,
+    parts::{join, parallelepiped, sphere, upright},
 };
 
 /// Rays in a batch.
@@ -271,7 +270,8 @@ fn a_set_with_itself_is_itself_exactly_and_less_itself_nothing() {
             assert!(hits.iter().all(Option::is_none), "{seed}: a skin is left");
         }
     }
-    tell(45, "A with A is A to the bit, A less A nothing", format!("{} rays", 3 * rays(100_000)));
+    HardCase::SolidWithItself
+        .tell("A with A is A to the bit, A less A nothing", format!("{} rays", 3 * rays(100_000)));
 }
 
 #[test]
@@ -349,8 +349,7 @@ fn solids_that_touch_have_no_face_between_them() {
             }
         }
     }
-    tell(
-        46,
+    HardCase::TouchingSolids.tell(
         "solids that touch have no face between them",
         format!("0 inner hits of {} rays", rays(100_000)),
     );
@@ -382,8 +381,7 @@ fn a_hole_whose_ends_are_flush_has_no_skin() {
             }
         }
     }
-    tell(
-        44,
+    HardCase::FlushFaces.tell(
         "a hole whose ends are flush has no skin",
         format!("0 speckles of {} rays", 2 * rays(100_000)),
     );
@@ -423,8 +421,7 @@ fn both_walls_of_a_shell_one_billionth_thick_are_met() {
             }
         }
     }
-    tell(
-        47,
+    HardCase::ThinShell.tell(
         "both walls of a shell of 1e-9 are met",
         format!("its thickness is right within {worst:.1e}"),
     );
@@ -468,7 +465,8 @@ fn a_solid_nested_a_thousand_deep_is_crossed_at_each_level_on_a_small_stack() {
         }
     };
     thread::Builder::new().stack_size(128 << 10).spawn(trace).unwrap().join().unwrap();
-    tell(48, "a solid nested 1000 deep is crossed at each level", "on a small stack");
+    HardCase::DeepNesting
+        .tell("a solid nested 1000 deep is crossed at each level", "on a small stack");
 }
 
 /// The volume by the lengths of parallel rays inside it.
@@ -598,8 +596,7 @@ fn a_sheared_box_is_met_where_the_oracle_meets_it_within_its_condition() {
     };
     let worst = (0..runs).into_par_iter().map(worst_of_run);
     let (worst, across) = worst.reduce(|| (0.0, 0.0), |a, b| (a.0.max(b.0), a.1.max(b.1)));
-    tell(
-        41,
+    HardCase::ShearedBox.tell(
         "sheared boxes of a condition up to 1e8 are met at the oracle's t",
         format!(
             "{} rays, within {worst:.2} ulp a condition, {across:.1} ulp across the face",
@@ -689,8 +686,7 @@ fn a_ray_in_the_plane_of_a_face_goes_in_and_out_or_neither() {
             assert!(is_close(&found, &truth), "{probe:?}: {found:?}, truly {truth:?}");
         }
     }
-    tell(
-        43,
+    HardCase::RayInFacePlane.tell(
         "a ray in the plane of a face goes in and out or neither",
         format!("{count} rays, {inside} stretches inside"),
     );

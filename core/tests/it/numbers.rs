@@ -1,13 +1,7 @@
 //! Numbers that are hard: shapes that are tiny, huge, far away, thin or grazed, and rays with
 //! zeros, NaNs and numbers next to zero. Each case tells what it measured.
 
-mod judge;
-mod long;
-mod studio;
-
 use glam::DVec3;
-use judge::check_against_oracle;
-use long::{few_rays, random, rays, tell};
 use rayon::prelude::*;
 use rtfarm_core::{
     isa::Isa,
@@ -21,10 +15,15 @@ use rtfarm_core::{
 use rtfarm_oracle::{
     Oracle,
     closed_forms::sphere_outline,
+    hard_case::{HardCase, few_rays, random, rays},
     random::Random,
     random_scene::{Aim, Recipe, Style, random_ray, random_scene},
 };
-use studio::{picture, pixels, quality, read, settings, whole};
+
+use crate::support::{
+    judge::check_against_oracle,
+    studio::{picture, pixels, quality, read, settings, whole},
+};
 
 type Block = PreparedScene<PreparedBytes>;
 
@@ -186,8 +185,7 @@ fn a_mesh_far_from_the_origin_is_met_within_four_ulp() {
         assert!(score.close * 1000 <= score.same, "moved by {offset}: {score:?}");
         total = total.join(score);
     }
-    tell(
-        4,
+    HardCase::FarMesh.tell(
         "a mesh moved by 0 to 1e9 is met at the oracle's t",
         format!("{} hits, within {:.2} ulp of max(|o|, t)", total.hits, total.steep),
     );
@@ -206,8 +204,7 @@ fn scenes_of_any_size_are_met_within_a_millionth_of_a_millionth() {
             total = total.join(compare(&scene, &probes, &format!("scaled by {factor:e}")));
         }
     }
-    tell(
-        7,
+    HardCase::TinyAndHugeScenes.tell(
         "scenes scaled by 1e-12 and 1e12, 1e-100 and 1e100 are met at the oracle's t",
         // Relative to a t that is tiny beside the coordinates nothing can be exact.
         format!(
@@ -250,8 +247,7 @@ fn a_skinny_triangle_that_is_grazed_is_not_met_outside_itself() {
             hits += 1;
         }
     }
-    tell(
-        8,
+    HardCase::GrazedSkinnyTriangle.tell(
         "a skinny triangle, grazed, is met inside its box",
         format!("{outside} of {hits} hits outside; {worst:.1} ulp at most"),
     );
@@ -277,8 +273,7 @@ fn slivers_are_met_where_the_oracle_meets_them() {
             .collect();
         total = total.join(compare(&scene, &probes, &format!("a sliver of 1:{aspect:e}")));
     }
-    tell(
-        9,
+    HardCase::Sliver.tell(
         "slivers down to an aspect of 1e-12 are met as the oracle says",
         format!(
             "{} of {} rays the same, {} hits",
@@ -305,8 +300,7 @@ fn a_huge_triangle_beside_tiny_ones_is_met_where_the_oracle_meets_it() {
         let probes = aimed(&scene, &mut random, few_rays(500));
         total = total.join(compare(&scene, &probes, "huge beside tiny"));
     }
-    tell(
-        12,
+    HardCase::HugeTriangle.tell(
         "a triangle of 1e5 beside those of 1 has no hit that the oracle lacks",
         format!("0 wrong of {} rays, {} more within rounding of an edge", total.same, total.close),
     );
@@ -337,8 +331,7 @@ fn a_sphere_seen_from_a_million_keeps_its_outline() {
         let score = compare(&scene, &probes, &format!("from {distance}"));
         total = total.join(score);
     }
-    tell(
-        13,
+    HardCase::FarSphere.tell(
         "a sphere of 1 seen from 1e3 to 1e7 has the oracle's outline and t",
         format!(
             "{} of {} rays misclassified, relative error of t {:.1e}",
@@ -377,8 +370,7 @@ fn a_camera_just_above_a_huge_sphere_keeps_its_height() {
         let errors: Vec<f64> = probes.par_iter().zip(found).filter_map(error).collect();
         worst = errors.into_iter().fold(worst, f64::max);
     }
-    tell(
-        14,
+    HardCase::HugeSphere.tell(
         "a sphere of 1e7 seen from just above it is met at its height",
         format!("{} hits, off by {worst:.1e} at most", total.hits),
     );
@@ -413,8 +405,7 @@ fn a_tangent_ray_is_told_right_but_for_four_ulp() {
             }
         }
     }
-    tell(
-        15,
+    HardCase::TangentRay.tell(
         "rays within 100 ulp of touching a sphere are told right",
         format!("{wrong} of {count} wrong, none farther than {worst:.1} ulp of the radius"),
     );
@@ -430,7 +421,7 @@ const PIXEL: f64 = 1.25;
 /// What a picture shows in all of small things, one moved about in each of side x side cells,
 /// against the pixels that they cover, in standard errors of as many independent samples.
 fn check_energy(
-    (case, what): (u32, &str),
+    (case, what): (HardCase, &str),
     (side, size, area): (u32, [f64; 2], f64),
     place: impl Fn(DVec3, &mut Scene, u32) -> f64,
 ) {
@@ -439,7 +430,7 @@ fn check_energy(
     let (mut seen, mut covered) = (0.0, 0.0);
     let cell = 8.0 * PIXEL / f64::from(side);
     for run in 0..runs as u64 {
-        let mut random = random(u64::from(case) * 100_000 + run);
+        let mut random = random(u64::from(case.row()) * 100_000 + run);
         let mut scene = read(VIEWPORT);
         for k in 0..side * side {
             let room = size.map(|size| (cell - size).max(0.0));
@@ -452,13 +443,13 @@ fn check_energy(
     }
     let (seen, covered) = (seen * f64::from(samples), covered * f64::from(samples));
     let off = (seen - covered) / covered.sqrt();
-    tell(
-        case,
+    case.tell(
         &format!("{what} of {area:.0e} pixels have their energy"),
         format!("{off:+.2} sigma: {seen:.0} samples hit of {covered:.0} expected"),
     );
-    // Case 19 holds to 3 sigma. Case 33 asks for no number of them: one seed in 370 is beyond 3.
-    let most = if case == 19 { 3.0 } else { 4.0 };
+    // Spheres hold to 3 sigma. Quadrangles are asked for no number of them: one seed in 370 is
+    // beyond 3.
+    let most = if case == HardCase::SubpixelSphere { 3.0 } else { 4.0 };
     assert!(off.abs() <= most, "{what}: {seen}, truly {covered}");
 }
 
@@ -468,7 +459,7 @@ fn spheres_far_smaller_than_a_pixel_have_their_energy() {
         let radius = PIXEL * (area / std::f64::consts::PI).sqrt();
         let viewport = read(VIEWPORT).viewport.unwrap();
         let cells = (side, [2.0 * radius; 2], area);
-        check_energy((19, "spheres"), cells, |corner, scene, primitive| {
+        check_energy((HardCase::SubpixelSphere, "spheres"), cells, |corner, scene, primitive| {
             let center = corner + DVec3::new(radius, radius, 0.0);
             scene.spheres.push(Sphere { center, radius, material: 0, primitive });
             let outline = sphere_outline(&viewport, settings(8, 8, 1).size, center, radius);
@@ -482,12 +473,16 @@ fn quadrangles_with_an_edge_of_a_ten_thousandth_are_seen() {
     for [wide, high] in [[1e-4, 0.15], [0.15, 1e-4]] {
         let area = wide * high / (PIXEL * PIXEL);
         let what = format!("quadrangles of {wide:e} x {high:e},");
-        check_energy((33, &what), (64, [wide, high], area), |corner, scene, primitive| {
-            let (u, v) = (DVec3::X * wide, DVec3::Y * high);
-            let vertices = [corner, corner + u, corner + u + v, corner + v];
-            scene.quadrangles.push(Quadrangle { vertices, material: 0, primitive });
-            area
-        });
+        check_energy(
+            (HardCase::SubpixelQuadrangle, &what),
+            (64, [wide, high], area),
+            |corner, scene, primitive| {
+                let (u, v) = (DVec3::X * wide, DVec3::Y * high);
+                let vertices = [corner, corner + u, corner + u + v, corner + v];
+                scene.quadrangles.push(Quadrangle { vertices, material: 0, primitive });
+                area
+            },
+        );
     }
 }
 
@@ -534,8 +529,7 @@ fn numbers_next_to_zero_change_nothing() {
         assert_eq!(hits[0], hits[1], "{probe:?}");
         count += 1;
     }
-    tell(
-        24,
+    HardCase::Denormal.tell(
         "denormal coordinates and directions give the picture and the hits of zeros",
         format!("{count} pixels and rays, all the same"),
     );
@@ -565,8 +559,7 @@ fn a_ray_without_a_direction_is_not_traced() {
             count += 1;
         }
     }
-    tell(
-        26,
+    HardCase::WrongDirection.tell(
         "rays with a direction of zero, NaN or infinity visit no box",
         format!("{count} rays"),
     );
@@ -590,8 +583,7 @@ fn a_hundred_thousand_triangles_in_one_place_are_one_to_the_eye() {
         assert!(many.primitive == 0 && (many.t - one.t).abs() < 1e-14, "{many:?}, not {one:?}");
     }
     let visits = many.count_visits(&probes).into_iter().max().unwrap();
-    tell(
-        28,
+    HardCase::ManyFacesInOnePlace.tell(
         "of 100 000 triangles in one place the first is met, through a tree of bounded depth",
         format!("{} rays, at most {visits} nodes each", probes.len()),
     );
@@ -622,11 +614,11 @@ fn needles_and_concave_quadrangles_are_met_where_the_oracle_meets_them() {
             *score = score.join(compare(&scene, &probes, "a quadrangle"));
         }
     }
-    for (case, what, score) in
-        [(32, "needles of quadrangles", needles), (34, "concave quadrangles", concave)]
-    {
-        tell(
-            case,
+    for (case, what, score) in [
+        (HardCase::Needle, "needles of quadrangles", needles),
+        (HardCase::ConcaveQuadrangle, "concave quadrangles", concave),
+    ] {
+        case.tell(
             &format!("{what} are met as the oracle says"),
             format!(
                 "{} of {} rays the same, {} hits",
@@ -683,8 +675,7 @@ fn a_quadrangle_with_three_corners_in_a_line_is_a_triangle() {
             count += 1;
         }
     }
-    tell(
-        35,
+    HardCase::CollinearCorners.tell(
         "a quadrangle with three corners in a line has the triangle's hits",
         format!(
             "{count} rays, {hits} hits, t within {worst:.1} ulp across the face; {close} of the \
@@ -728,7 +719,8 @@ fn planes_a_ten_millionth_apart_are_met_in_their_order() {
             }
         }
     }
-    tell(60, "of planes 1e-7 apart the nearer is met first", format!("0 wrong of {count} rays"));
+    HardCase::NearParallelPlanes
+        .tell("of planes 1e-7 apart the nearer is met first", format!("0 wrong of {count} rays"));
 }
 
 /// `count` x `count` squares that fill -1..1 in the plane at `z`.
@@ -753,12 +745,18 @@ fn of_faces_in_many_boxes_the_first_is_met() {
     let strips: Vec<[DVec3; 4]> = (0..50).map(strip).collect();
     let mut scenes = Vec::new();
     for wall in [tiled_plane(1, z), tiled_plane(12, z)] {
-        scenes.push((66, [strips.clone(), wall.clone()].concat()));
-        scenes.push((66, [wall, strips.clone()].concat()));
+        scenes.push((HardCase::CoincidentFaces, [strips.clone(), wall.clone()].concat()));
+        scenes.push((HardCase::CoincidentFaces, [wall, strips.clone()].concat()));
     }
     for gap in [1e-7, 1e-9] {
-        scenes.push((60, [tiled_plane(13, z), tiled_plane(11, z + gap)].concat()));
-        scenes.push((60, [tiled_plane(1, z), tiled_plane(12, z + gap)].concat()));
+        scenes.push((
+            HardCase::NearParallelPlanes,
+            [tiled_plane(13, z), tiled_plane(11, z + gap)].concat(),
+        ));
+        scenes.push((
+            HardCase::NearParallelPlanes,
+            [tiled_plane(1, z), tiled_plane(12, z + gap)].concat(),
+        ));
     }
     let (mut counts, mut hits) = ([0, 0], 0);
     for (stream, (case, faces)) in (6600..).zip(&scenes) {
@@ -777,17 +775,15 @@ fn of_faces_in_many_boxes_the_first_is_met() {
                 assert_eq!(found, truth[k], "{isa}: {:?}", probes[k]);
             }
         }
-        counts[usize::from(*case == 66)] += probes.len();
+        counts[usize::from(*case == HardCase::CoincidentFaces)] += probes.len();
     }
     assert!(hits > rays(50_000));
     let [apart, coincident] = counts;
-    tell(
-        60,
+    HardCase::NearParallelPlanes.tell(
         "of planes 1e-7 and 1e-9 apart in many boxes the nearer is met, as without boxes",
         format!("0 wrong of {apart} rays"),
     );
-    tell(
-        66,
+    HardCase::CoincidentFaces.tell(
         "of coincident faces in many boxes the first is met, as without boxes",
         format!("0 wrong of {coincident} rays"),
     );
@@ -823,8 +819,7 @@ fn pictures_do_not_depend_on_instructions_or_threads() {
             }
         }
     }
-    tell(
-        65,
+    HardCase::AnyMachine.tell(
         "every instruction set and 1, 2 and 8 threads give the same bits",
         format!("{count} pixels, {blocks} prepared scenes"),
     );
@@ -844,7 +839,8 @@ fn a_scene_of_any_size_is_seen_through_a_screen_of_one() {
         assert!(seen.iter().all(|pixel| *pixel == [1.0; 3]), "a sky of {radius:e}");
         count += seen.len();
     }
-    tell(61, "skies of 1e8 to 1e300 are seen", format!("{count} pixels, all of them"));
+    HardCase::HugeSky
+        .tell("skies of 1e8 to 1e300 are seen", format!("{count} pixels, all of them"));
 }
 
 /// A viewport, materials and what follows: the message of the first error.
@@ -872,33 +868,38 @@ fn what_no_picture_can_show_is_refused() {
     let flat = "parallelepiped vertex 0 0 0 vertex 1 0 0 vertex 0 1 0 vertex 1 1 0 material m
         endparallelepiped";
     for (case, what, viewport, geometry) in [
-        (20, "a radius of 0", SCREEN, ball("0")),
-        (20, "a negative radius", SCREEN, ball("-1")),
-        (20, "a radius that is NaN", SCREEN, ball("nan")),
-        (25, "an infinite radius", SCREEN, ball("inf")),
-        (25, "a number beyond all", SCREEN, ball("1e999")),
+        (HardCase::WrongRadius, "a radius of 0", SCREEN, ball("0")),
+        (HardCase::WrongRadius, "a negative radius", SCREEN, ball("-1")),
+        (HardCase::WrongRadius, "a radius that is NaN", SCREEN, ball("nan")),
+        (HardCase::NotFinite, "an infinite radius", SCREEN, ball("inf")),
+        (HardCase::NotFinite, "a number beyond all", SCREEN, ball("1e999")),
         (
-            36,
+            HardCase::SelfCrossingQuadrangle,
             "a quadrangle that crosses itself",
             SCREEN,
             quadrangle(["0 0 0", "1 1 0", "1 0 0", "0 1 0"]),
         ),
-        (37, "a bent quadrangle", SCREEN, quadrangle(["0 0 0", "1 0 0", "1 1 0.1", "0 1 0"])),
-        (42, "a box without a volume", SCREEN, flat.to_owned()),
         (
-            62,
+            HardCase::BentQuadrangle,
+            "a bent quadrangle",
+            SCREEN,
+            quadrangle(["0 0 0", "1 0 0", "1 1 0.1", "0 1 0"]),
+        ),
+        (HardCase::BoxWithoutVolume, "a box without a volume", SCREEN, flat.to_owned()),
+        (
+            HardCase::WrongScreen,
             "screen corners in a line",
             "origin 0 0 5 topleft -1 1 4 bottomleft 0 1 4 topright 1 1 4",
             ball("1"),
         ),
         (
-            62,
+            HardCase::WrongScreen,
             "an eye in the screen's plane",
             "origin 5 5 4 topleft -1 1 4 bottomleft -1 -1 4 topright 1 1 4",
             ball("1"),
         ),
     ] {
-        tell(case, &format!("{what} is refused"), refusal(viewport, &geometry));
+        case.tell(&format!("{what} is refused"), refusal(viewport, &geometry));
     }
 }
 
@@ -913,12 +914,13 @@ fn triangles_without_area_are_dropped_and_counted() {
         read(&format!("viewport {SCREEN} endviewport {materials} geometry {faces} endgeometry"))
     };
     let alone = picture(&scene(&whole), &settings(64, 64, 4));
-    for (case, what, nothing) in
-        [(10, "a triangle of no area", &line), (11, "a triangle of three equal corners", &point)]
-    {
+    for (case, what, nothing) in [
+        (HardCase::TriangleWithoutArea, "a triangle of no area", &line),
+        (HardCase::TriangleOfOnePoint, "a triangle of three equal corners", &point),
+    ] {
         let scene = scene(&format!("{nothing}{whole}{nothing}"));
         assert_eq!((scene.dropped.zero_area, scene.triangles.len()), (2, 1), "{what}");
         assert!(picture(&scene, &settings(64, 64, 4)) == alone, "{what}");
-        tell(case, &format!("{what} is dropped and counted"), "the picture is the same to the bit");
+        case.tell(&format!("{what} is dropped and counted"), "the picture is the same to the bit");
     }
 }

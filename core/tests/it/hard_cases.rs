@@ -2,23 +2,27 @@
 
 #![expect(clippy::float_cmp, reason = "what holds exactly is tested exactly")]
 
-mod long;
-mod parts;
-mod studio;
-
 use std::fmt::Write;
 
 use glam::DVec3;
-use long::{random, rays, tell};
-use parts::{join, sphere, upright};
 use rtfarm_core::{
     isa::Isa,
     prepared::{PreparedBytes, PreparedScene},
     scene::{Quadrangle, Scene, Sphere},
     trace::Probe,
 };
-use rtfarm_oracle::{Oracle, closed_forms::irradiance, eye_direction, random::Random};
-use studio::{picture, pixels, prepared, read, settings};
+use rtfarm_oracle::{
+    Oracle,
+    closed_forms::irradiance,
+    eye_direction,
+    hard_case::{HardCase, random, rays},
+    random::Random,
+};
+
+use crate::support::{
+    parts::{join, sphere, upright},
+    studio::{picture, pixels, prepared, read, settings},
+};
 
 const BLACK: [f32; 3] = [0.0; 3];
 
@@ -103,7 +107,8 @@ fn a_light_on_a_flat_surface_gives_it_nothing() {
             }
         }
     }
-    tell(56, "a light on a flat surface gives it nothing", "60 surfaces of 1600 pixels");
+    HardCase::LightOnSurface
+        .tell("a light on a flat surface gives it nothing", "60 surfaces of 1600 pixels");
 }
 
 #[test]
@@ -118,7 +123,8 @@ fn a_light_on_a_sphere_gives_it_nothing_outside_or_inside() {
             }
         }
     }
-    tell(56, "a light on a sphere gives it nothing", "40 spheres of 1600 pixels");
+    HardCase::LightOnSurface
+        .tell("a light on a sphere gives it nothing", "40 spheres of 1600 pixels");
 }
 
 #[test]
@@ -126,8 +132,7 @@ fn a_light_at_a_point_that_a_ray_hits_gives_it_nothing() {
     // The middle pixel's ray runs along z.
     let scene = scene(&lamp(0.0, 0.0, 0.0), &wall(0.0, 9.0, "white"));
     assert!(picture(&scene, &settings(41, 41, 1)).into_iter().all(|pixel| pixel == BLACK));
-    tell(
-        58,
+    HardCase::LightAtEyeOrHit.tell(
         "a light at the point that a ray hits gives it nothing",
         "1681 pixels, all dark and finite",
     );
@@ -151,8 +156,7 @@ fn a_light_on_a_surface_still_lights_what_faces_it() {
     for (found, truth) in [(edge, at(20, 0)), (corner, at(3, 0))] {
         assert!((found[0] - truth).abs() < 1e-6 * truth, "{found:?}, truly {truth}");
     }
-    tell(
-        27,
+    HardCase::LightOnItsSurface.tell(
         "a light on a surface lights what faces it, without a shadow of that surface",
         "right within 1e-6",
     );
@@ -173,8 +177,7 @@ fn a_light_inside_an_opaque_sphere_leaves_all_outside_exactly_dark() {
             assert_eq!(pixel, BLACK, "{seed}: pixel {k}");
         }
     }
-    tell(
-        57,
+    HardCase::LightInOpaqueSolid.tell(
         "outside an opaque sphere that holds a light all is exactly dark",
         format!("{} pixels", 30 * side * side),
     );
@@ -231,7 +234,8 @@ fn a_light_inside_a_shell_of_a_solid_leaves_all_outside_exactly_dark() {
             }
         }
     }
-    tell(57, "outside a shell that holds a light all is exactly dark", format!("{count} places"));
+    HardCase::LightInOpaqueSolid
+        .tell("outside a shell that holds a light all is exactly dark", format!("{count} places"));
 }
 
 #[test]
@@ -257,8 +261,7 @@ fn a_light_inside_a_shell_of_a_solid_lights_all_of_its_inside() {
             }
         }
     }
-    tell(
-        57,
+    HardCase::LightInOpaqueSolid.tell(
         "inside a shell that holds a light all is lit",
         format!("{count} places, in round cavities right within {worst:.1e}"),
     );
@@ -280,7 +283,8 @@ fn a_light_at_the_eye_leaves_no_shadow_to_be_seen() {
         let error = (f64::from(pixel[0]) - truth).abs() / truth;
         assert!(error < 1e-6, "pixel {k} is {pixel:?}, truly {truth}");
     }
-    tell(58, "a light at the eye leaves no shadow to be seen", "4096 pixels, right within 1e-6");
+    HardCase::LightAtEyeOrHit
+        .tell("a light at the eye leaves no shadow to be seen", "4096 pixels, right within 1e-6");
 }
 
 #[test]
@@ -309,8 +313,7 @@ fn a_sphere_has_no_acne_up_to_its_terminator() {
         }
         assert!(lit > 50, "{what}: {lit} pixels are lit");
     }
-    tell(
-        59,
+    HardCase::Terminator.tell(
         "a sphere has no acne up to its terminator",
         "5 spheres of 9216 pixels, no wrong pixel",
     );
@@ -358,7 +361,8 @@ fn the_first_of_equal_spheres_wins() {
         check_first_wins("spheres", &red, &(green.clone() + &green));
         check_first_wins("spheres", &green, &red);
     }
-    tell(66, "of equal spheres the first is seen", "10 pictures, no wrong pixel");
+    HardCase::CoincidentFaces
+        .tell("of equal spheres the first is seen", "10 pictures, no wrong pixel");
 }
 
 #[test]
@@ -370,7 +374,8 @@ fn the_first_of_equal_triangles_wins_wherever_its_corners_begin() {
         check_first_wins(&what, &polygon(&[a, b, c], "red"), &copies);
         check_first_wins(&what, &polygon(&[a, c, b], "red"), &copies);
     }
-    tell(66, "of equal triangles the first is seen", "44 pictures, no wrong pixel");
+    HardCase::CoincidentFaces
+        .tell("of equal triangles the first is seen", "44 pictures, no wrong pixel");
 }
 
 #[test]
@@ -379,7 +384,8 @@ fn the_first_of_equal_quadrangles_wins_wherever_its_corners_begin() {
         let copies = polygon(&[b, c, d, a], "green") + &polygon(&[d, c, b, a], "white");
         check_first_wins(&what, &polygon(&[a, b, c, d], "red"), &copies);
     }
-    tell(66, "of equal quadrangles the first is seen", "22 pictures, no wrong pixel");
+    HardCase::CoincidentFaces
+        .tell("of equal quadrangles the first is seen", "22 pictures, no wrong pixel");
 }
 
 #[test]
@@ -394,8 +400,7 @@ fn the_first_wins_of_a_quadrangle_and_triangles_over_it() {
         let label = [b, a, d].map(|corner| middle + (corner - middle) / 4.0);
         check_first_wins(&what, &quadrangle, &polygon(&label, "white"));
     }
-    tell(
-        66,
+    HardCase::CoincidentFaces.tell(
         "of a quadrangle and triangles over it the first is seen",
         "6 pictures, no wrong pixel",
     );
@@ -413,7 +418,8 @@ fn of_planes_that_are_nearly_one_the_nearer_is_seen_and_shades_the_other() {
         let alone = picture(&scene(&lights, &near), &settings);
         assert!(both == alone);
     }
-    tell(60, "of planes 1e-7 apart the nearer is seen and lit", "12 800 pixels, no wrong pixel");
+    HardCase::NearParallelPlanes
+        .tell("of planes 1e-7 apart the nearer is seen and lit", "12 800 pixels, no wrong pixel");
 }
 
 #[test]
@@ -425,7 +431,7 @@ fn a_sky_of_a_hundred_million_is_seen() {
     let green = seen.iter().filter(|pixel| **pixel == [0.0, 0.5, 0.0]).count();
     assert_eq!((seen[0], seen[32 * 64 + 32]), ([0.0, 0.5, 0.0], [0.5, 0.0, 0.0]));
     assert_eq!(red + green, seen.len());
-    tell(61, "a sky of 1e8 is seen", "4096 pixels, no wrong pixel");
+    HardCase::HugeSky.tell("a sky of 1e8 is seen", "4096 pixels, no wrong pixel");
 }
 
 /// The six sides of a cube around the eye of [`scene`], turned outwards.
@@ -471,7 +477,7 @@ fn a_needle_of_a_quadrangle_is_whole() {
         // At z = 0 the screen is 4 x 4: the needle takes the middle half of it.
         assert_eq!(white, 32 * 32, "{width}");
     }
-    tell(32, "needles of quadrangles down to 1e-12 wide are whole", "no pixel lacks");
+    HardCase::Needle.tell("needles of quadrangles down to 1e-12 wide are whole", "no pixel lacks");
 }
 
 /// The faces of boxes without thickness and rays that run in their planes or straight at them.
@@ -521,9 +527,10 @@ fn rays_along_the_axes_meet_flat_boxes_whatever_the_sign_of_their_zeros() {
         }
     }
     let count = format!("{} rays, with every instruction set", probes.len());
-    tell(21, "rays along the axes, from the planes of boxes, meet what they should", &count);
-    tell(22, "a zero with a sign gives the hits of one without", &count);
-    tell(23, "boxes without thickness are met", count);
+    HardCase::AxisParallelRay
+        .tell("rays along the axes, from the planes of boxes, meet what they should", &count);
+    HardCase::NegativeZero.tell("a zero with a sign gives the hits of one without", &count);
+    HardCase::FlatBox.tell("boxes without thickness are met", count);
 }
 
 #[test]
@@ -544,7 +551,8 @@ fn pictures_may_be_one_pixel_or_as_wide_as_can_be() {
         let last = pixels(&prepared(&scene), &settings(width, height, 1), corner);
         assert_eq!(last, [BLACK]);
     }
-    tell(63, "pictures of 1 x 1, 65 535 x 1 and 1 x 65 535 are right", "no wrong pixel");
+    HardCase::ExtremePictureSizes
+        .tell("pictures of 1 x 1, 65 535 x 1 and 1 x 65 535 are right", "no wrong pixel");
 }
 
 /// A sphere of some size somewhere, alone or the only part of a solid.
@@ -602,8 +610,7 @@ fn a_ray_from_inside_a_sphere_goes_out_once() {
             count += 1;
         }
     }
-    tell(
-        16,
+    HardCase::InsideSphere.tell(
         "a ray from inside a sphere goes out once",
         format!("{count} rays, at {:.1} ulp of it or nearer", 16.0 * worst),
     );
@@ -651,8 +658,7 @@ fn a_ray_that_leaves_a_sphere_outwards_never_meets_it_again() {
         count += probes.len();
         grazing += starts.iter().filter(|start| start.1.abs() < 1e-6 * ball.radius).count();
     }
-    tell(
-        17,
+    HardCase::LeavingSphereOutward.tell(
         "a ray that leaves a sphere outwards never meets it",
         format!("0 of {count} rays, {grazing} of them grazing"),
     );
@@ -678,8 +684,7 @@ fn a_ray_that_leaves_a_sphere_inwards_always_meets_its_other_side() {
             count += 1;
         }
     }
-    tell(
-        18,
+    HardCase::LeavingSphereInward.tell(
         "a ray that leaves a sphere inwards meets its other side",
         format!("0 of {count} lost; they end within {:.1} ulp of it", 16.0 * worst),
     );
