@@ -6,11 +6,11 @@ use clap::{Args as ClapArgs, Parser, Subcommand, ValueEnum, value_parser};
 use rtfarm_coordinator::Wish;
 use rtfarm_core::{
     isa::{Isa, IsaError},
-    picture::PictureFormat,
     render::{DEFAULT_CUTOFF, DEFAULT_ERROR, DEFAULT_MOST_SAMPLES, Quality, Sampling},
     tile::{Size, SizeError, TileGrid},
     transfer::Transfer,
 };
+use rtfarm_picture::PictureFormat;
 use rtfarm_proto::Address;
 
 use crate::output::Output;

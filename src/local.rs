@@ -13,12 +13,8 @@ use std::{
 use anyhow::Context;
 use rayon::ThreadPoolBuilder;
 use rtfarm_coordinator::{Order, Progress, TileCost, log_tile, new_picture};
-use rtfarm_core::{
-    isa::Isa,
-    picture::{Picture, PutError},
-    prepared::PreparedScene,
-    render::render_tile,
-};
+use rtfarm_core::{isa::Isa, prepared::PreparedScene, render::render_tile};
+use rtfarm_picture::{Picture, PutError};
 use rtfarm_proto::WorkerId;
 use tokio::{sync::watch, time::Instant};
 use tokio_util::sync::CancellationToken;

@@ -9,7 +9,7 @@ use std::{
 
 use anyhow::{Context, bail, ensure};
 use rtfarm_coordinator::folder_of;
-use rtfarm_core::picture::PictureFormat;
+use rtfarm_picture::PictureFormat;
 use tempfile::NamedTempFile;
 use tokio_util::sync::CancellationToken;
 

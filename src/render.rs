@@ -12,12 +12,12 @@ use std::{
 use anyhow::{Context, anyhow};
 use rtfarm_coordinator::{Config, Coordinator, End, Job, Listener, Order, Progress, Refusal};
 use rtfarm_core::{
-    picture::Picture,
     read::draw_diagnostics,
     render::{Sampling, Tally},
     tile::Size,
     transfer::Transfer,
 };
+use rtfarm_picture::Picture;
 use rtfarm_proto::Address;
 use tempfile::TempDir;
 use tokio::{net::UnixListener, sync::watch, task::spawn_blocking, time::Instant};

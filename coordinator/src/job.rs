@@ -3,10 +3,10 @@
 use std::{collections::BTreeSet, time::Duration};
 
 use rtfarm_core::{
-    picture::Picture,
     render::{Settings, Tally},
     tile::TileGrid,
 };
+use rtfarm_picture::Picture;
 use rtfarm_proto::{JobId, WorkerId};
 use tokio::{sync::watch, time::Instant};
 

@@ -1,7 +1,6 @@
 //! An order: from a scene's text to what a job needs.
 
 use rtfarm_core::{
-    picture::PictureFormat,
     prepare::{PrepareError, prepare},
     prepared::PreparedBytes,
     read::{Diagnostic, Omitted, Reading, Resolve, read_scene_with},
@@ -10,6 +9,7 @@ use rtfarm_core::{
     tile::{Size, TileGrid},
     transfer::Transfer,
 };
+use rtfarm_picture::PictureFormat;
 
 /// The most tiles that a picture may be cut into; each costs the coordinator some 100 bytes.
 pub const MOST_TILES: u32 = 1 << 20;

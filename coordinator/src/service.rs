@@ -9,11 +9,11 @@ use std::{
 };
 
 use rtfarm_core::{
-    picture::{PutError, check_pixels},
     read::{Style, draw_diagnostics},
     render::Tally,
     tile::{Size, TileId},
 };
+use rtfarm_picture::{PutError, check_pixels};
 use rtfarm_proto::{
     CHUNK_BYTES, JobId, LONGEST_WAIT, LeaseName, MESSAGE_BYTES, PROTOCOL, WireError, WorkerId,
     pixels_from_bytes, scene_hash, transfer,

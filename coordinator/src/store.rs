@@ -8,11 +8,11 @@ use std::{
 };
 
 use rtfarm_core::{
-    picture::{Picture, PictureFormat},
     prepared::{PreparedBytes, SceneHash},
     tile::Size,
     transfer::Transfer,
 };
+use rtfarm_picture::{Picture, PictureFormat};
 use rustix::{
     fs::{FallocateFlags, fallocate},
     io::Errno,

@@ -41,7 +41,6 @@ mod emitter;
 mod gather;
 pub mod isa;
 pub mod left_out;
-pub mod picture;
 mod pixel;
 mod quadrangle;
 mod ray;

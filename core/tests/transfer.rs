@@ -8,12 +8,12 @@ use std::io::Cursor;
 
 use image::{DynamicImage, ImageFormat, RgbImage};
 use rtfarm_core::{
-    picture::{Picture, PictureFormat},
     read::{Reading, read_scene_with},
     render::Settings,
     scene::Scene,
     transfer::Transfer,
 };
+use rtfarm_picture::{Picture, PictureFormat};
 use studio::{picture, settings, whole};
 
 const BOTH: [Transfer; 2] = [Transfer::None, Transfer::Srgb];

@@ -18,7 +18,7 @@ use exr::{
 };
 use rayon::prelude::*;
 
-use crate::{
+use rtfarm_core::{
     tile::{Area, Size},
     transfer::Transfer,
 };
@@ -257,8 +257,9 @@ pub fn check_pixels(area: Area, pixels: &[[f32; 3]]) -> Result<(), PutError> {
 mod tests {
     use std::io::Cursor;
 
+    use rtfarm_core::tile::TileGrid;
+
     use super::*;
-    use crate::tile::TileGrid;
 
     /// A picture put tile by tile and encoded, read back by another reader of the format.
     fn round_trip(
