@@ -12,7 +12,7 @@ use std::{
 
 use anyhow::Context;
 use rayon::ThreadPoolBuilder;
-use rtfarm_coordinator::{Order, Progress, TileCost, log_tile, new_picture};
+use rtfarm_coordinator::{Order, Progress, TileCost, log_tile};
 use rtfarm_core::{isa::Isa, prepared::PreparedScene, render::render_tile};
 use rtfarm_picture::{Picture, PutError};
 use rtfarm_proto::WorkerId;
@@ -28,7 +28,7 @@ pub(crate) fn render(
     stop: &CancellationToken,
 ) -> anyhow::Result<Option<(Picture, Duration)>> {
     let Order { prepared, settings, grid, transfer, format, .. } = order;
-    let picture = new_picture(folder, settings.size, format, transfer)
+    let picture = Picture::new_in(folder, settings.size, format, transfer)
         .with_context(|| format!("cannot make the picture's file in {}", folder.display()))?;
     let scene = PreparedScene::open(prepared)?;
     let pool = ThreadPoolBuilder::new().num_threads(threads).build()?;

@@ -16,4 +16,3 @@ pub use job::{End, Job, Progress};
 pub use log::{TileCost, log_tile};
 pub use order::{MOST_TILES, Order, Placed, Refusal, Wish};
 pub use run::{Config, Coordinator, Listener, SubmitError};
-pub use store::{folder_of, new_picture};

@@ -9,6 +9,7 @@ use std::{
 };
 
 use rtfarm_core::tile::TileId;
+use rtfarm_picture::Picture;
 use rtfarm_proto::{JobId, WorkerId};
 use tokio::{
     net::{TcpListener, UnixListener},
@@ -25,7 +26,7 @@ use crate::{
     lease::Loss,
     order::Order,
     service,
-    store::{SceneFile, new_picture},
+    store::SceneFile,
 };
 
 /// How a coordinator works.
@@ -112,7 +113,7 @@ impl Coordinator {
         let scene = SceneFile::write(scene_folder, &prepared)
             .map_err(|error| SubmitError::Scene(scene_folder.clone(), error))?;
         drop(prepared);
-        let picture = new_picture(picture_folder, settings.size, format, transfer)
+        let picture = Picture::new_in(picture_folder, settings.size, format, transfer)
             .map_err(|error| SubmitError::Picture(picture_folder.clone(), error))?;
 
         let id = self.shared.jobs().number_job();
