@@ -3,13 +3,13 @@
 use std::{fmt, path::PathBuf, str::FromStr, time::Duration};
 
 use clap::{Args as ClapArgs, Parser, Subcommand, ValueEnum, value_parser};
-use rtfarm_coordinator::Wish;
 use rtfarm_core::{
     isa::{Isa, IsaError},
     render::{DEFAULT_CUTOFF, DEFAULT_ERROR, DEFAULT_MOST_SAMPLES, Quality, Sampling},
     tile::{Size, SizeError, TileGrid},
     transfer::Transfer,
 };
+use rtfarm_job::Wish;
 use rtfarm_picture::PictureFormat;
 use rtfarm_proto::Address;
 

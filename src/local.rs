@@ -12,8 +12,8 @@ use std::{
 
 use anyhow::Context;
 use rayon::ThreadPoolBuilder;
-use rtfarm_coordinator::{Order, Progress, TileCost, log_tile};
 use rtfarm_core::{isa::Isa, prepared::PreparedScene, render::render_tile};
+use rtfarm_job::{Order, Progress, TileCost, log_tile};
 use rtfarm_picture::{Picture, PutError};
 use rtfarm_proto::WorkerId;
 use tokio::{sync::watch, time::Instant};

@@ -10,13 +10,14 @@ use std::{
 };
 
 use anyhow::{Context, anyhow};
-use rtfarm_coordinator::{Config, Coordinator, End, Job, Listener, Order, Progress, Refusal};
+use rtfarm_coordinator::{Config, Coordinator, Job, Listener};
 use rtfarm_core::{
     read::draw_diagnostics,
     render::{Sampling, Tally},
     tile::Size,
     transfer::Transfer,
 };
+use rtfarm_job::{End, Order, Progress, Refusal};
 use rtfarm_picture::Picture;
 use rtfarm_proto::Address;
 use tempfile::TempDir;

@@ -10,8 +10,8 @@ use std::{
 };
 
 use anyhow::{Context, anyhow};
-use rtfarm_coordinator::{Progress, Wish};
 use rtfarm_core::{read::read_scene, tile::Size};
+use rtfarm_job::{Progress, Wish};
 use rtfarm_proto::{
     CHUNK_BYTES, MESSAGE_BYTES, PROTOCOL,
     wire::{self, event, jobs_client::JobsClient, submit_request::Part, submit_response::Outcome},

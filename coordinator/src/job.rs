@@ -1,13 +1,9 @@
 //! A job: its scene, its picture, how far it is.
 
-use std::{collections::BTreeSet, time::Duration};
-
-use rtfarm_core::{
-    render::{Settings, Tally},
-    tile::TileGrid,
-};
+use rtfarm_core::{render::Settings, tile::TileGrid};
+use rtfarm_job::{End, Progress};
 use rtfarm_picture::Picture;
-use rtfarm_proto::{JobId, WorkerId};
+use rtfarm_proto::JobId;
 use tokio::{sync::watch, time::Instant};
 
 use crate::store::SceneFile;
@@ -23,32 +19,6 @@ pub struct Job {
     pub(crate) picture: Picture,
     pub(crate) started: Instant,
     pub(crate) progress: watch::Sender<Progress>,
-}
-
-/// How far a job is.
-#[derive(Debug, Clone, Default)]
-pub struct Progress {
-    /// Tiles in the picture.
-    pub tiles_done: u32,
-    /// Tiles of the picture.
-    pub tile_count: u32,
-    /// What the tiles in the picture took.
-    pub tally: Tally,
-    /// Workers that brought some of them.
-    pub workers: BTreeSet<WorkerId>,
-    /// Tiles of which two copies differed.
-    pub differing_tiles: u32,
-    /// How it ended, once it has.
-    pub end: Option<End>,
-}
-
-/// How a job ended.
-#[derive(Debug, Clone, PartialEq)]
-pub enum End {
-    /// Every tile is in the picture, after that time.
-    Finished(Duration),
-    /// It will never be.
-    Failed(String),
 }
 
 impl Job {

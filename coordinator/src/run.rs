@@ -9,6 +9,7 @@ use std::{
 };
 
 use rtfarm_core::tile::TileId;
+use rtfarm_job::{End, Order, Progress};
 use rtfarm_picture::Picture;
 use rtfarm_proto::{JobId, WorkerId};
 use tokio::{
@@ -20,14 +21,7 @@ use tokio_stream::wrappers::{TcpListenerStream, UnixListenerStream};
 use tokio_util::sync::CancellationToken;
 use tonic::transport::server::Router;
 
-use crate::{
-    job::{End, Job, Progress},
-    jobs::Jobs,
-    lease::Loss,
-    order::Order,
-    service,
-    store::SceneFile,
-};
+use crate::{job::Job, jobs::Jobs, lease::Loss, service, store::SceneFile};
 
 /// How a coordinator works.
 #[derive(Debug, Clone)]

@@ -13,6 +13,7 @@ use rtfarm_core::{
     render::Tally,
     tile::{Size, TileId},
 };
+use rtfarm_job::{End, Placed, Progress, Refusal, TileCost, Wish, log_tile};
 use rtfarm_picture::{PutError, check_pixels};
 use rtfarm_proto::{
     CHUNK_BYTES, JobId, LONGEST_WAIT, LeaseName, MESSAGE_BYTES, PROTOCOL, WireError, WorkerId,
@@ -32,10 +33,9 @@ use tonic::{
 };
 
 use crate::{
-    job::{End, Job, Progress},
+    job::Job,
     jobs::{Next, NoMember},
     lease::{PixelHash, Verdict},
-    order::{Placed, Refusal, Wish},
     run::{Coordinator, Shared},
 };
 
@@ -261,14 +261,7 @@ impl Shared {
             now_done.clone_from(progress);
         });
         let (done, count) = (now_done.tiles_done, now_done.tile_count);
-        crate::log_tile(
-            done,
-            count,
-            tile,
-            worker,
-            &crate::TileCost { seconds, rays: tally.rays },
-            elapsed,
-        );
+        log_tile(done, count, tile, worker, &TileCost { seconds, rays: tally.rays }, elapsed);
         if done == count {
             self.end(job.id, End::Finished(elapsed));
         }

@@ -1,0 +1,32 @@
+//! How far a job is.
+
+use std::{collections::BTreeSet, time::Duration};
+
+use rtfarm_core::render::Tally;
+use rtfarm_proto::WorkerId;
+
+/// How far a job is.
+#[derive(Debug, Clone, Default)]
+pub struct Progress {
+    /// Tiles in the picture.
+    pub tiles_done: u32,
+    /// Tiles of the picture.
+    pub tile_count: u32,
+    /// What the tiles in the picture took.
+    pub tally: Tally,
+    /// Workers that brought some of them.
+    pub workers: BTreeSet<WorkerId>,
+    /// Tiles of which two copies differed.
+    pub differing_tiles: u32,
+    /// How it ended, once it has.
+    pub end: Option<End>,
+}
+
+/// How a job ended.
+#[derive(Debug, Clone, PartialEq)]
+pub enum End {
+    /// Every tile is in the picture, after that time.
+    Finished(Duration),
+    /// It will never be.
+    Failed(String),
+}
