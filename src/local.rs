@@ -13,9 +13,8 @@ use std::{
 use anyhow::Context;
 use rayon::ThreadPoolBuilder;
 use rtfarm_core::{isa::Isa, prepared::PreparedScene, render::render_tile};
-use rtfarm_job::{Order, Progress, TileCost, log_tile};
+use rtfarm_job::{FinishedTile, Order, Progress};
 use rtfarm_picture::{Picture, PutError};
-use rtfarm_proto::WorkerId;
 use tokio::{sync::watch, time::Instant};
 use tokio_util::sync::CancellationToken;
 
@@ -53,14 +52,14 @@ pub(crate) fn render(
                 failure.lock().expect("nothing here panics").get_or_insert(error);
                 return;
             }
-            let mut done = 0;
+            let mut now_done = Progress::default();
             progress.send_modify(|progress| {
                 progress.tiles_done += 1;
                 progress.tally.add(&rendered.tally);
-                done = progress.tiles_done;
+                now_done.clone_from(progress);
             });
-            let cost = TileCost { seconds, rays: rendered.tally.rays };
-            log_tile(done, grid.count(), tile, WorkerId(0), &cost, started.elapsed());
+            let rays = rendered.tally.rays;
+            FinishedTile { tile, worker: None, seconds, rays }.log(&now_done, started.elapsed());
         }
     });
     if let Some(error) = failure.into_inner().expect("nothing here panics") {

@@ -1,9 +1,11 @@
 //! A job: its scene, its picture, how far it is.
 
+use std::{collections::BTreeSet, sync::Mutex};
+
 use rtfarm_core::{render::Settings, tile::TileGrid};
 use rtfarm_job::{End, Progress};
 use rtfarm_picture::Picture;
-use rtfarm_proto::JobId;
+use rtfarm_proto::{JobId, WorkerId};
 use tokio::{sync::watch, time::Instant};
 
 use crate::store::SceneFile;
@@ -19,6 +21,8 @@ pub struct Job {
     pub(crate) picture: Picture,
     pub(crate) started: Instant,
     pub(crate) progress: watch::Sender<Progress>,
+    /// Those that have brought a tile.
+    pub(crate) workers: Mutex<BTreeSet<WorkerId>>,
 }
 
 impl Job {
@@ -35,6 +39,11 @@ impl Job {
     /// How far it is, now and later.
     pub fn progress(&self) -> watch::Receiver<Progress> {
         self.progress.subscribe()
+    }
+
+    /// Notes that `worker` has brought a tile; says whether it is its first.
+    pub(crate) fn note_worker(&self, worker: WorkerId) -> bool {
+        self.workers.lock().expect("a set never panics").insert(worker)
     }
 
     /// Ends the job, unless it has ended; says whether it had not.

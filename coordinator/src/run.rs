@@ -114,7 +114,9 @@ impl Coordinator {
         let progress =
             watch::Sender::new(Progress { tile_count: grid.count(), ..Progress::default() });
         let started = Instant::now();
-        let job = Arc::new(Job { id, name, scene, settings, grid, picture, started, progress });
+        let workers = Mutex::default();
+        let job =
+            Arc::new(Job { id, name, scene, settings, grid, picture, started, progress, workers });
         self.shared.keep(&job);
         tracing::info!(
             job = id.0,

@@ -13,7 +13,7 @@ use rtfarm_core::{
     render::Tally,
     tile::{Size, TileId},
 };
-use rtfarm_job::{End, Placed, Progress, Refusal, TileCost, Wish, log_tile};
+use rtfarm_job::{End, FinishedTile, Placed, Progress, Refusal, Wish};
 use rtfarm_picture::{PutError, check_pixels};
 use rtfarm_proto::{
     CHUNK_BYTES, JobId, LONGEST_WAIT, LeaseName, MESSAGE_BYTES, PROTOCOL, WireError, WorkerId,
@@ -253,16 +253,17 @@ impl Shared {
         (tally, seconds): (Tally, f64),
     ) {
         let elapsed = job.started.elapsed();
+        let is_first_of_worker = job.note_worker(worker);
         let mut now_done = Progress::default();
         job.progress.send_modify(|progress| {
             progress.tiles_done += 1;
             progress.tally.add(&tally);
-            progress.workers.insert(worker);
+            progress.worker_count += u32::from(is_first_of_worker);
             now_done.clone_from(progress);
         });
-        let (done, count) = (now_done.tiles_done, now_done.tile_count);
-        log_tile(done, count, tile, worker, &TileCost { seconds, rays: tally.rays }, elapsed);
-        if done == count {
+        let (worker, rays) = (Some(worker.0), tally.rays);
+        FinishedTile { tile, worker, seconds, rays }.log(&now_done, elapsed);
+        if now_done.tiles_done == now_done.tile_count {
             self.end(job.id, End::Finished(elapsed));
         }
     }
@@ -428,7 +429,7 @@ fn to_event(progress: &Progress) -> wire::Event {
         tiles_done: progress.tiles_done,
         tile_count: progress.tile_count,
         tally: Some(progress.tally.into()),
-        workers: progress.workers.len() as u32,
+        workers: progress.worker_count,
         differing_tiles: progress.differing_tiles,
         end: progress.end.as_ref().map(|end| match end {
             End::Finished(time) => {

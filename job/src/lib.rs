@@ -7,6 +7,6 @@ mod log;
 mod order;
 mod progress;
 
-pub use log::{TileCost, log_tile};
+pub use log::FinishedTile;
 pub use order::{MOST_TILES, Order, Placed, Refusal, Wish};
 pub use progress::{End, Progress};

@@ -3,34 +3,37 @@
 use std::time::Duration;
 
 use rtfarm_core::tile::TileId;
-use rtfarm_proto::WorkerId;
 
-/// What a tile took its worker.
+use crate::Progress;
+
+/// A tile that was rendered, and what it took.
 #[derive(Debug, Clone, Copy)]
-pub struct TileCost {
+pub struct FinishedTile {
+    /// Which one.
+    pub tile: TileId,
+    /// The number of the worker that brought it; `None` where the process renders by itself.
+    pub worker: Option<u32>,
     /// Time on one thread, in seconds.
     pub seconds: f64,
     /// Rays traced.
     pub rays: u64,
 }
 
-/// Logs that a tile is in the picture, as the `done`th of `count`, `elapsed` after the start.
-pub fn log_tile(
-    done: u32,
-    count: u32,
-    tile: TileId,
-    worker: WorkerId,
-    cost: &TileCost,
-    elapsed: Duration,
-) {
-    let left = elapsed.as_secs_f64() / f64::from(done) * f64::from(count - done);
-    let mrays = cost.rays as f64 / 1e6 / cost.seconds.max(1e-9);
-    tracing::info!(
-        worker = worker.0,
-        tile = tile.number(),
-        ms = (cost.seconds * 1e3).round() as u64,
-        mrays = (mrays * 10.0).round() / 10.0,
-        left = %format_args!("{left:.0}s"),
-        "tile {done}/{count} done"
-    );
+impl FinishedTile {
+    /// Logs that the tile is in the picture, as the last of those in `progress`, `elapsed` after
+    /// the start.
+    pub fn log(&self, progress: &Progress, elapsed: Duration) {
+        let Self { tile, worker, seconds, rays } = *self;
+        let Progress { tiles_done: done, tile_count: count, .. } = *progress;
+        let left = elapsed.as_secs_f64() / f64::from(done) * f64::from(count - done);
+        let mrays = rays as f64 / 1e6 / seconds.max(1e-9);
+        tracing::info!(
+            worker,
+            tile = tile.number(),
+            ms = (seconds * 1e3).round() as u64,
+            mrays = (mrays * 10.0).round() / 10.0,
+            left = %format_args!("{left:.0}s"),
+            "tile {done}/{count} done"
+        );
+    }
 }

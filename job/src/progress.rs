@@ -1,9 +1,8 @@
 //! How far a job is.
 
-use std::{collections::BTreeSet, time::Duration};
+use std::time::Duration;
 
 use rtfarm_core::render::Tally;
-use rtfarm_proto::WorkerId;
 
 /// How far a job is.
 #[derive(Debug, Clone, Default)]
@@ -14,8 +13,8 @@ pub struct Progress {
     pub tile_count: u32,
     /// What the tiles in the picture took.
     pub tally: Tally,
-    /// Workers that brought some of them.
-    pub workers: BTreeSet<WorkerId>,
+    /// Workers that brought some of them; none where the process renders by itself.
+    pub worker_count: u32,
     /// Tiles of which two copies differed.
     pub differing_tiles: u32,
     /// How it ended, once it has.
