@@ -3,7 +3,7 @@
 use std::{collections::BTreeSet, sync::Mutex};
 
 use rtfarm_core::{render::Settings, tile::TileGrid};
-use rtfarm_job::{End, Progress};
+use rtfarm_job::{Outcome, Progress};
 use rtfarm_picture::Picture;
 use rtfarm_proto::{JobId, WorkerId};
 use tokio::{sync::watch, time::Instant};
@@ -47,10 +47,10 @@ impl Job {
     }
 
     /// Ends the job, unless it has ended; says whether it had not.
-    pub(crate) fn end(&self, end: End) -> bool {
+    pub(crate) fn end(&self, outcome: Outcome) -> bool {
         self.progress.send_if_modified(|progress| {
-            let is_first = progress.end.is_none();
-            progress.end.get_or_insert(end);
+            let is_first = progress.outcome.is_none();
+            progress.outcome.get_or_insert(outcome);
             is_first
         })
     }

@@ -9,7 +9,7 @@ use std::{
 };
 
 use rtfarm_core::tile::TileId;
-use rtfarm_job::{End, Order, Progress};
+use rtfarm_job::{Order, Outcome, Progress};
 use rtfarm_picture::Picture;
 use rtfarm_proto::{JobId, WorkerId};
 use tokio::{
@@ -140,7 +140,7 @@ impl Coordinator {
         self.shared.jobs().on_end(job);
         let forgotten = self.shared.kept().remove(&job);
         if let Some(job) = forgotten
-            && job.end(End::Failed("it was cancelled".to_owned()))
+            && job.end(Outcome::Failed("it was cancelled".to_owned()))
         {
             tracing::info!(job = job.id.0, "job cancelled");
         }
@@ -228,7 +228,7 @@ impl Shared {
         let mut kept = self.kept();
         let ended: Vec<JobId> = kept
             .iter()
-            .filter(|(_, job)| job.progress.borrow().end.is_some())
+            .filter(|(_, job)| job.progress.borrow().outcome.is_some())
             .map(|(&id, _)| id)
             .collect();
         for old in ended.iter().take(ended.len().saturating_sub(KEPT_AFTER_END)) {
@@ -238,12 +238,12 @@ impl Shared {
     }
 
     /// Ends a job, unless it has ended.
-    pub(crate) fn end(&self, job: JobId, end: End) {
+    pub(crate) fn end(&self, job: JobId, outcome: Outcome) {
         self.jobs().on_end(job);
         if let Some(job) = self.job(job) {
             let reason =
-                if let End::Failed(reason) = &end { reason.clone() } else { String::new() };
-            if job.end(end) && !reason.is_empty() {
+                if let Outcome::Failed(reason) = &outcome { reason.clone() } else { String::new() };
+            if job.end(outcome) && !reason.is_empty() {
                 tracing::warn!(job = job.id.0, reason, "job failed");
             }
         }
@@ -251,7 +251,7 @@ impl Shared {
 
     fn end_all(&self, reason: &str) {
         for job in self.kept_jobs() {
-            self.end(job.id, End::Failed(reason.to_owned()));
+            self.end(job.id, Outcome::Failed(reason.to_owned()));
         }
     }
 

@@ -18,12 +18,12 @@ pub struct Progress {
     /// Tiles of which two copies differed.
     pub differing_tiles: u32,
     /// How it ended, once it has.
-    pub end: Option<End>,
+    pub outcome: Option<Outcome>,
 }
 
 /// How a job ended.
 #[derive(Debug, Clone, PartialEq)]
-pub enum End {
+pub enum Outcome {
     /// Every tile is in the picture, after that time.
     Finished(Duration),
     /// It will never be.
