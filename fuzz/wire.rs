@@ -2,7 +2,8 @@
 //! test with every file of its corpus.
 
 use prost::Message;
-use rtfarm_core::{picture::PictureFormat, render::Settings, tile::Size};
+use rtfarm_core::{render::Settings, tile::Size};
+use rtfarm_picture::PictureFormat;
 use rtfarm_proto::{LeaseName, pixels_from_bytes, pixels_to_bytes, scene_hash, transfer, wire};
 
 /// A message of the kind that the first byte says: it is refused, or written again it is read as

@@ -3,14 +3,14 @@
 use std::{fmt, path::PathBuf, str::FromStr, time::Duration};
 
 use clap::{Args as ClapArgs, Parser, Subcommand, ValueEnum, value_parser};
-use rtfarm_coordinator::Wish;
 use rtfarm_core::{
     isa::{Isa, IsaError},
-    picture::PictureFormat,
     render::{DEFAULT_CUTOFF, DEFAULT_ERROR, DEFAULT_MOST_SAMPLES, Quality, Sampling},
     tile::{Size, SizeError, TileGrid},
     transfer::Transfer,
 };
+use rtfarm_job::RenderRequest;
+use rtfarm_picture::PictureFormat;
 use rtfarm_proto::Address;
 
 use crate::output::Output;
@@ -123,7 +123,7 @@ pub(crate) struct PictureArgs {
     #[arg(short, long = "output", value_name = "FILE")]
     output: PathBuf,
 
-    /// The picture's size in pixels; the scene's own wish by default.
+    /// The picture's size in pixels; the size that the scene asks for by default.
     #[arg(long, value_name = "WxH", value_parser = parse_size)]
     size: Option<Size>,
 
@@ -325,8 +325,8 @@ impl PictureArgs {
     }
 
     /// What is wanted of the scene.
-    pub(crate) fn wish(&self, format: PictureFormat) -> Wish {
-        Wish {
+    pub(crate) fn request(&self, format: PictureFormat) -> RenderRequest {
+        RenderRequest {
             name: self.scene.name(),
             strict: self.scene.strict,
             size: self.size,

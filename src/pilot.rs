@@ -3,7 +3,6 @@
 use std::time::Duration;
 
 use rayon::prelude::*;
-use rtfarm_coordinator::Order;
 use rtfarm_core::{
     isa::Isa,
     prepared::{PreparedBytes, PreparedScene},
@@ -11,6 +10,7 @@ use rtfarm_core::{
     sample::MOST_SAMPLES,
     tile::{Area, Size},
 };
+use rtfarm_job::Order;
 use tokio::time::Instant;
 use tokio_util::sync::CancellationToken;
 

@@ -15,7 +15,6 @@ use image::{ImageBuffer, Rgb};
 use rayon::prelude::*;
 use rtfarm_core::{
     isa::Isa,
-    picture::{Picture, PictureFormat},
     prepare::prepare,
     prepared::PreparedScene,
     read::read_scene,
@@ -23,6 +22,7 @@ use rtfarm_core::{
     tile::{Area, Size},
     transfer::Transfer,
 };
+use rtfarm_picture::{Picture, PictureFormat};
 
 type Image = ImageBuffer<Rgb<u16>, Vec<u16>>;
 

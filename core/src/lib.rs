@@ -23,7 +23,6 @@ pub mod prepared;
 
 // A prepared scene into tiles.
 mod light;
-pub mod picture;
 pub mod render;
 mod shade;
 pub mod trace;

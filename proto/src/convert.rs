@@ -2,12 +2,12 @@
 
 use prost::bytes::Bytes;
 use rtfarm_core::{
-    picture::PictureFormat,
     prepared::SceneHash,
     render::{Quality, Sampling, Settings, Tally},
     tile::{Size, SizeError},
     transfer::Transfer,
 };
+use rtfarm_picture::PictureFormat;
 
 use crate::wire;
 

@@ -285,10 +285,7 @@ mod tests {
     use rtfarm_oracle::hard_case::HardCase;
 
     use super::*;
-<<<<<<< HEAD:core/src/prepare/bvh.rs
-    use crate::{long::tell, prepared::node::MOST_LEVELS};
-=======
->>>>>>> build:core/src/bvh.rs
+    use crate::prepared::node::MOST_LEVELS;
 
     fn check(boxes: &[([f32; 3], [f32; 3])]) -> Vec<Node> {
         let mut leaflets: Vec<Leaflet> = boxes

@@ -5,12 +5,12 @@ use std::io::Cursor;
 
 use image::{DynamicImage, ImageFormat, RgbImage};
 use rtfarm_core::{
-    picture::{Picture, PictureFormat},
     read::{Reading, read_scene_with},
     render::Settings,
     scene::Scene,
     transfer::Transfer,
 };
+use rtfarm_picture::{Picture, PictureFormat};
 
 use crate::support::studio::{self, picture, settings, whole};
 

@@ -1,7 +1,6 @@
 //! An order: from a scene's text to what a job needs.
 
 use rtfarm_core::{
-    picture::PictureFormat,
     prepare::{PrepareError, prepare},
     prepared::PreparedBytes,
     read::{Diagnostic, Omitted, Reading, Resolve, read_scene_with},
@@ -10,18 +9,19 @@ use rtfarm_core::{
     tile::{Size, TileGrid},
     transfer::Transfer,
 };
+use rtfarm_picture::PictureFormat;
 
 /// The most tiles that a picture may be cut into; each costs the coordinator some 100 bytes.
 pub const MOST_TILES: u32 = 1 << 20;
 
 /// What somebody wants rendered, before the scene is known.
 #[derive(Debug, Clone)]
-pub struct Wish {
+pub struct RenderRequest {
     /// What the scene is called in logs.
     pub name: String,
     /// Every warning is an error.
     pub strict: bool,
-    /// The frame; the scene's own wish when missing.
+    /// The frame; the size that the scene asks for when missing.
     pub size: Option<Size>,
     /// How good the picture is to be.
     pub quality: Quality,
@@ -50,7 +50,7 @@ pub struct Order {
     pub format: PictureFormat,
 }
 
-/// What came of a wish and a scene's text.
+/// What came of a request and a scene's text.
 #[derive(Debug)]
 pub struct Placed {
     /// The order, or why there is none.
@@ -61,7 +61,7 @@ pub struct Placed {
     pub omitted: Omitted,
 }
 
-/// Why a wish is not granted.
+/// Why a request cannot be rendered.
 #[derive(Debug)]
 pub enum Refusal {
     /// The diagnostics say it.
@@ -70,7 +70,7 @@ pub enum Refusal {
     Other(String),
 }
 
-impl Wish {
+impl RenderRequest {
     /// Reads and prepares the scene. This takes long: never call it on the async runtime.
     pub fn place(self, text: &[u8], resolve: &Resolve<'_>) -> Placed {
         let reading = read_scene_with(text, resolve, self.transfer);

@@ -4,66 +4,20 @@ use std::{
     fs::File,
     io::{self, Seek, Write},
     os::unix::fs::FileExt,
+    path::Path,
 };
 
-use exr::{
-    block::{self, BlockIndex, UncompressedBlock, writer::ChunksWriter},
-    compression::Compression,
-    math::Vec2,
-    meta::{
-        BlockDescription,
-        attribute::{ChannelDescription, LineOrder, SampleType, Text},
-        header::Header,
-    },
-};
-use rayon::prelude::*;
-
-use crate::{
+use ::png::BitDepth;
+use rtfarm_core::{
     tile::{Area, Size},
     transfer::Transfer,
 };
+use rustix::{
+    fs::{FallocateFlags, fallocate},
+    io::Errno,
+};
 
-/// How a picture is written. All light is on channels where 1.0 stands for 255 in a scene.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub enum PictureFormat {
-    /// PNG with 8 bits a channel: clamped once, rounded once.
-    Png8,
-    /// PNG with 16 bits a channel: clamped once, rounded once.
-    Png16,
-    /// `OpenEXR` with 32-bit floats, never clamped.
-    ExrF32,
-}
-
-impl PictureFormat {
-    /// Bytes that a pixel takes in the picture's file.
-    pub fn bytes_per_pixel(self) -> usize {
-        match self {
-            Self::Png8 => 3,
-            Self::Png16 => 6,
-            Self::ExrF32 => 12,
-        }
-    }
-
-    /// Appends a pixel as the picture's file holds it.
-    fn append(self, bytes: &mut Vec<u8>, pixel: [f32; 3], transfer: Transfer) {
-        for channel in pixel {
-            match self {
-                Self::Png8 => bytes.push(quantize(channel, transfer, 255.0) as u8),
-                // PNG has the high byte first.
-                Self::Png16 => {
-                    let step = quantize(channel, transfer, 65_535.0) as u16;
-                    bytes.extend(step.to_be_bytes());
-                }
-                Self::ExrF32 => bytes.extend(channel.to_ne_bytes()),
-            }
-        }
-    }
-}
-
-/// Clamps to `0..=1`, encodes and rounds to the nearest step, halves upwards.
-fn quantize(channel: f32, transfer: Transfer, steps: f64) -> f64 {
-    (transfer.encode(f64::from(channel).clamp(0.0, 1.0)) * steps + 0.5).floor()
-}
+use crate::{PictureFormat, exr, png};
 
 /// Why a tile cannot be put into a picture.
 #[derive(Debug, thiserror::Error)]
@@ -112,6 +66,26 @@ impl Picture {
         Ok(Self { file, size, format, transfer })
     }
 
+    /// Makes a black picture in a file of `folder` that has no name, so that nothing stays behind
+    /// however the process ends. Its bytes are reserved: a full disk is an error now, not later.
+    pub fn new_in(
+        folder: &Path,
+        size: Size,
+        format: PictureFormat,
+        transfer: Transfer,
+    ) -> io::Result<Self> {
+        let file = tempfile::tempfile_in(folder)?;
+        let byte_count = Self::byte_count(size, format);
+        loop {
+            match fallocate(&file, FallocateFlags::empty(), 0, byte_count) {
+                Ok(()) | Err(Errno::OPNOTSUPP) => break,
+                Err(Errno::INTR) => {}
+                Err(error) => return Err(error.into()),
+            }
+        }
+        Self::new(file, size, format, transfer)
+    }
+
     /// Bytes that the file of such a picture takes.
     pub fn byte_count(size: Size, format: PictureFormat) -> u64 {
         size.pixel_count() * format.bytes_per_pixel() as u64
@@ -125,6 +99,11 @@ impl Picture {
     /// What [`Picture::encode`] writes.
     pub fn format(&self) -> PictureFormat {
         self.format
+    }
+
+    /// The curve by which a PNG is encoded.
+    pub(crate) fn transfer(&self) -> Transfer {
+        self.transfer
     }
 
     /// Writes the pixels of `area`, `[y][x]` row by row. The area must lie inside the picture.
@@ -147,88 +126,21 @@ impl Picture {
     /// A few bands of rows are in memory at a time.
     pub fn encode(&self, out: impl Write + Seek) -> io::Result<()> {
         match self.format {
-            PictureFormat::Png8 => self.encode_png(out, png::BitDepth::Eight),
-            PictureFormat::Png16 => self.encode_png(out, png::BitDepth::Sixteen),
-            PictureFormat::ExrF32 => self.encode_exr(out),
+            PictureFormat::Png8 => png::encode(self, BitDepth::Eight, out),
+            PictureFormat::Png16 => png::encode(self, BitDepth::Sixteen, out),
+            PictureFormat::ExrF32 => exr::encode(self, out),
         }
     }
 
-    fn encode_png(&self, out: impl Write, depth: png::BitDepth) -> io::Result<()> {
-        const CHUNK_BYTES: usize = 1 << 16;
-        let mut encoder = png::Encoder::new(out, self.size.width(), self.size.height());
-        encoder.set_color(png::ColorType::Rgb);
-        encoder.set_depth(depth);
-        encoder.set_compression(png::Compression::Fast);
-        if self.transfer == Transfer::Srgb {
-            encoder.set_source_srgb(png::SrgbRenderingIntent::Perceptual);
-        }
-        let mut writer = encoder.write_header()?;
-        let mut stream = writer.stream_writer_with_size(CHUNK_BYTES)?;
-        for y in 0..self.size.height() {
-            stream.write_all(&self.read_rows(y, 1)?)?;
-        }
-        stream.finish()?;
-        writer.finish()?;
-        Ok(())
-    }
-
-    fn encode_exr(&self, out: impl Write + Seek) -> io::Result<()> {
-        const BLOCKS_AT_ONCE: usize = 8;
-        // The format wants channels in alphabetical order.
-        let channels = ["B", "G", "R"]
-            .map(|name| ChannelDescription::named(Text::new_or_panic(name), SampleType::F32));
-        let size = Vec2(self.size.width() as usize, self.size.height() as usize);
-        let header =
-            Header::new(Text::new_or_panic("rtfarm"), size, channels.into_iter().collect())
-                .with_encoding(
-                    Compression::ZIP16,
-                    BlockDescription::ScanLines,
-                    LineOrder::Increasing,
-                );
-        block::write(out, [header].into_iter().collect(), true, |meta, writer| {
-            let blocks: Vec<(usize, BlockIndex)> =
-                block::enumerate_ordered_header_block_indices(&meta.headers).collect();
-            for band in blocks.chunks(BLOCKS_AT_ONCE) {
-                let chunks: Vec<_> = band
-                    .par_iter()
-                    .map(|&(place, index)| {
-                        let block = UncompressedBlock { index, data: self.exr_block(index)? };
-                        Ok((place, block.compress_to_chunk(&meta.headers)?))
-                    })
-                    .collect::<exr::error::Result<_>>()?;
-                for (place, chunk) in chunks {
-                    writer.write_chunk(place, chunk)?;
-                }
-            }
-            Ok(())
-        })
-        .map_err(|error| match error {
-            exr::error::Error::Io(error) => error,
-            other => io::Error::other(other),
-        })
-    }
-
-    /// The samples of some rows, `[y][channel][x]`, blue first.
-    fn exr_block(&self, index: BlockIndex) -> io::Result<Vec<u8>> {
-        let rows = self.read_rows(index.pixel_position.1 as u32, index.pixel_size.1 as u32)?;
-        let mut block = Vec::with_capacity(rows.len());
-        for row in rows.chunks_exact(self.row_bytes()) {
-            for channel in [2, 1, 0] {
-                for pixel in row.chunks_exact(12) {
-                    block.extend_from_slice(&pixel[channel * 4..][..4]);
-                }
-            }
-        }
-        Ok(block)
-    }
-
-    fn read_rows(&self, y: u32, count: u32) -> io::Result<Vec<u8>> {
+    /// The bytes of `count` rows from `y` on.
+    pub(crate) fn read_rows(&self, y: u32, count: u32) -> io::Result<Vec<u8>> {
         let mut bytes = vec![0; self.row_bytes() * count as usize];
         self.file.read_exact_at(&mut bytes, self.offset(0, y))?;
         Ok(bytes)
     }
 
-    fn row_bytes(&self) -> usize {
+    /// Bytes that a row takes.
+    pub(crate) fn row_bytes(&self) -> usize {
         self.size.width() as usize * self.format.bytes_per_pixel()
     }
 
@@ -257,8 +169,9 @@ pub fn check_pixels(area: Area, pixels: &[[f32; 3]]) -> Result<(), PutError> {
 mod tests {
     use std::io::Cursor;
 
+    use rtfarm_core::tile::TileGrid;
+
     use super::*;
-    use crate::tile::TileGrid;
 
     /// A picture put tile by tile and encoded, read back by another reader of the format.
     fn round_trip(
@@ -331,34 +244,6 @@ mod tests {
     }
 
     #[test]
-    fn encoding_gives_the_nearest_step() {
-        for steps in [255.0, 65_535.0] {
-            let count = steps as u32;
-            for step in 0..count {
-                let (below, above) = (f64::from(step), f64::from(step + 1));
-                let found = |light: f32| quantize(light, Transfer::Srgb, steps);
-                assert_eq!(found(Transfer::Srgb.decode(below / steps) as f32), below);
-                // The numbers next to where the curve is half-way between two steps.
-                let number = (below + 0.5) / steps;
-                let middle = if number <= 0.040_45 {
-                    number / 12.92
-                } else {
-                    libm::pow((number + 0.055) / 1.055, 2.4)
-                };
-                let nearest = middle as f32;
-                let is_above = f64::from(nearest) > middle;
-                let (low, high) = if is_above {
-                    (nearest.next_down(), nearest)
-                } else {
-                    (nearest, nearest.next_up())
-                };
-                assert_eq!((found(low), found(high)), (below, above), "{step} of {count}");
-            }
-            assert_eq!(quantize(1.0, Transfer::Srgb, steps), steps);
-        }
-    }
-
-    #[test]
     fn an_encoded_png_says_so_and_an_exr_stays_light() {
         let srgb = |format| {
             let size = Size::new(1, 1).unwrap();
@@ -372,8 +257,8 @@ mod tests {
         };
         for format in [PictureFormat::Png8, PictureFormat::Png16] {
             let file = srgb(format);
-            let reader = png::Decoder::new(Cursor::new(&file)).read_info().unwrap();
-            assert_eq!(reader.info().srgb, Some(png::SrgbRenderingIntent::Perceptual));
+            let reader = ::png::Decoder::new(Cursor::new(&file)).read_info().unwrap();
+            assert_eq!(reader.info().srgb, Some(::png::SrgbRenderingIntent::Perceptual));
             // 188 of 255 is half the light of white.
             let image = image::load_from_memory(&file).unwrap();
             assert_eq!(image.into_rgb8().get_pixel(0, 0).0, [188, 255, 0]);
@@ -392,5 +277,20 @@ mod tests {
         assert_eq!(error.to_string(), "the pixel (2, 2) is not a number");
         let error = picture.put(area, &[[0.0; 3]]).unwrap_err();
         assert_eq!(error.to_string(), "a tile of 2 pixels came with 1");
+    }
+
+    #[test]
+    fn a_picture_in_a_folder_has_no_name_there() {
+        let folder = tempfile::tempdir().unwrap();
+        let size = Size::new(2, 1).unwrap();
+        let (format, transfer) = (PictureFormat::Png8, Transfer::None);
+        let picture = Picture::new_in(folder.path(), size, format, transfer).unwrap();
+        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0);
+        let mut out = Cursor::new(Vec::new());
+        picture.encode(&mut out).unwrap();
+        let image = image::load_from_memory(out.get_ref()).unwrap().into_rgb8();
+        assert_eq!(image.into_raw(), [0; 6], "it is black");
+        let missing = folder.path().join("missing");
+        Picture::new_in(&missing, size, format, transfer).unwrap_err();
     }
 }
