@@ -90,8 +90,7 @@ fn check_settings(settings: wire::Settings) {
     if let Ok(known) = Settings::try_from(settings) {
         assert!((1..=65_535).contains(&known.size.width()));
         assert!((1..=65_535).contains(&known.size.height()));
-        let quality = known.quality;
-        assert!((0.0..=1.0).contains(&quality.cutoff));
+        assert!((0.0..=1.0).contains(&known.quality.cutoff.get()));
         assert_eq!(wire::Settings::from(known), settings);
     }
 }

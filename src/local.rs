@@ -43,7 +43,9 @@ pub(crate) fn render(
             let tile_started = Instant::now();
             let area = grid.area(tile);
             let mut on_progress = on_progress;
-            let Some(rendered) = render_tile(&scene, &settings, area, isa, &mut on_progress) else {
+            let Some(rendered) =
+                render_tile(&scene, &settings.quality, area, isa, &mut on_progress)
+            else {
                 return;
             };
             let seconds = tile_started.elapsed().as_secs_f64();

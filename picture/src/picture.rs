@@ -106,18 +106,17 @@ impl Picture {
         self.transfer
     }
 
-    /// Writes the pixels of `area`, `[y][x]` row by row. The area must lie inside the picture.
+    /// Writes the pixels of `area`, `[y][x]` row by row. It must be an area of a frame of the picture's size.
     pub fn put(&self, area: Area, pixels: &[[f32; 3]]) -> Result<(), PutError> {
-        assert!(area.x0 + area.width <= self.size.width(), "the area is inside the picture");
-        assert!(area.y0 + area.height <= self.size.height(), "the area is inside the picture");
+        assert_eq!(area.frame(), self.size, "the area is one of the picture's");
         check_pixels(area, pixels)?;
-        let mut bytes = Vec::with_capacity(area.width as usize * self.format.bytes_per_pixel());
-        for (y, row) in (area.y0..).zip(pixels.chunks_exact(area.width as usize)) {
+        let mut bytes = Vec::with_capacity(area.width() as usize * self.format.bytes_per_pixel());
+        for (y, row) in area.rows().zip(pixels.chunks_exact(area.width() as usize)) {
             bytes.clear();
             for &pixel in row {
                 self.format.append(&mut bytes, pixel, self.transfer);
             }
-            self.file.write_all_at(&bytes, self.offset(area.x0, y))?;
+            self.file.write_all_at(&bytes, self.offset(area.x0(), y))?;
         }
         Ok(())
     }
@@ -157,8 +156,7 @@ pub fn check_pixels(area: Area, pixels: &[[f32; 3]]) -> Result<(), PutError> {
     }
     match pixels.iter().position(|pixel| pixel.iter().any(|channel| channel.is_nan())) {
         Some(index) => {
-            let index = index as u32;
-            let (x, y) = (area.x0 + index % area.width, area.y0 + index / area.width);
+            let (x, y) = area.pixel_at(index as u32);
             Err(PutError::NotANumber { x, y })
         }
         None => Ok(()),
@@ -184,10 +182,7 @@ mod tests {
         let picture = Picture::new(tempfile::tempfile().unwrap(), size, format, transfer).unwrap();
         for tile in grid.render_order() {
             let area = grid.area(tile);
-            let pixels: Vec<[f32; 3]> = (area.y0..area.y0 + area.height)
-                .flat_map(|y| (area.x0..area.x0 + area.width).map(move |x| (x, y)))
-                .map(|(x, y)| pixel(x, y))
-                .collect();
+            let pixels: Vec<[f32; 3]> = area.pixels().map(|(x, y)| pixel(x, y)).collect();
             picture.put(area, &pixels).unwrap();
         }
         let encode = || {
@@ -249,8 +244,7 @@ mod tests {
             let size = Size::new(1, 1).unwrap();
             let file = tempfile::tempfile().unwrap();
             let picture = Picture::new(file, size, format, Transfer::Srgb).unwrap();
-            let area = Area { x0: 0, y0: 0, width: 1, height: 1 };
-            picture.put(area, &[[0.5, 7.0, -1.0]]).unwrap();
+            picture.put(Area::whole(size), &[[0.5, 7.0, -1.0]]).unwrap();
             let mut out = Cursor::new(Vec::new());
             picture.encode(&mut out).unwrap();
             out.into_inner()
@@ -272,7 +266,7 @@ mod tests {
         let size = Size::new(4, 4).unwrap();
         let file = tempfile::tempfile().unwrap();
         let picture = Picture::new(file, size, PictureFormat::Png8, Transfer::None).unwrap();
-        let area = Area { x0: 1, y0: 2, width: 2, height: 1 };
+        let area = Area::new(size, [1, 2], [2, 1]).unwrap();
         let error = picture.put(area, &[[0.0; 3], [0.0, f32::NAN, 0.0]]).unwrap_err();
         assert_eq!(error.to_string(), "the pixel (2, 2) is not a number");
         let error = picture.put(area, &[[0.0; 3]]).unwrap_err();

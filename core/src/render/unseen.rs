@@ -58,6 +58,7 @@ const OCTAGON: f64 = 1.053_907_0;
 /// The search for what pixels may hide.
 pub(crate) struct Beams<'a> {
     view: &'a View<'a>,
+    frame: Size,
     eye: DVec3,
     /// From the eye to the frame's top left corner, and a pixel's step to the right and down.
     screen: [DVec3; 3],
@@ -190,6 +191,7 @@ impl<'a> Beams<'a> {
             .map(|row| row / volume);
         rows.iter().all(|row| row.is_finite()).then(|| Self {
             view,
+            frame: size,
             eye: DVec3::from_array(camera.eye),
             screen: [top_left, right, down],
             rows,
@@ -225,18 +227,19 @@ impl<'a> Beams<'a> {
         on_found: &mut impl FnMut(u32, u32, Unseen),
     ) {
         let Some((&(side, most), smaller)) = sizes.split_first() else {
-            let (x, y) = (area.x0, area.y0);
+            let (x, y) = (area.x0(), area.y0());
             return self.search_crowded(x, y, &look(x, y), on_found);
         };
-        for block in blocks(area, side) {
-            let deepest = pixels_of(block)
+        for block in area.blocks(side) {
+            let deepest = block
+                .pixels()
                 .map(|(x, y)| self.depth_of(x, y, look(x, y).hits))
                 .fold(0.0, f64::max);
             if !self.gather(block, deepest, most) {
                 self.search_blocks(block, smaller, look, on_found);
                 continue;
             }
-            for (x, y) in pixels_of(block) {
+            for (x, y) in block.pixels() {
                 let look = look(x, y);
                 let unseen = self.find_unseen(x, y, &look, self.depth_of(x, y, look.hits));
                 if !unseen.is_empty() {
@@ -255,7 +258,7 @@ impl<'a> Beams<'a> {
         look: &Look<'_>,
         on_found: &mut impl FnMut(u32, u32, Unseen),
     ) {
-        let pixel = Area { x0: x, y0: y, width: 1, height: 1 };
+        let pixel = Area::pixel(self.frame, x, y);
         let nearest = look.hits.iter().map(|hit| hit.t).fold(f64::INFINITY, f64::min);
         let middle = self.direction([f64::from(x) + 0.5, f64::from(y) + 0.5]).length();
         let before = nearest / middle * (1.0 - BEFORE * self.step / middle);
@@ -324,7 +327,7 @@ impl<'a> Beams<'a> {
         let [depth, across, down] = self.rows;
         let frame = &self.view.header.frame;
         let origin = (DVec3::from_array(frame.origin) - self.eye) * frame.scale;
-        let Area { x0, y0, width, height } = block;
+        let (columns, rows) = (block.columns(), block.rows());
         let side = |row: DVec3, factor: f64, sign: f64, depth_limit: f64| {
             let normal = sign * (row - factor * depth);
             let terms = row.abs() + factor * depth.abs();
@@ -332,10 +335,10 @@ impl<'a> Beams<'a> {
             Side { normal, least: -(normal.dot(origin) + depth_limit) - slack * MARGIN }
         };
         [
-            side(across, f64::from(x0), 1.0, 0.0),
-            side(across, f64::from(x0 + width), -1.0, 0.0),
-            side(down, f64::from(y0), 1.0, 0.0),
-            side(down, f64::from(y0 + height), -1.0, 0.0),
+            side(across, f64::from(columns.start), 1.0, 0.0),
+            side(across, f64::from(columns.end), -1.0, 0.0),
+            side(down, f64::from(rows.start), 1.0, 0.0),
+            side(down, f64::from(rows.end), -1.0, 0.0),
             side(depth, 0.0, 1.0, 0.0),
             side(depth, 0.0, -1.0, deepest * frame.scale),
         ]
@@ -467,7 +470,7 @@ impl<'a> Beams<'a> {
 
     /// What may hide in a pixel up to a depth, among the outlines of its block.
     fn find_unseen(&mut self, x: u32, y: u32, look: &Look<'_>, deepest: f64) -> Unseen {
-        let pixel = Area { x0: x, y0: y, width: 1, height: 1 };
+        let pixel = Area::pixel(self.frame, x, y);
         let mut unseen = Unseen::default();
         let mut suspects = std::mem::take(&mut self.suspects);
         suspects.clear();
@@ -574,7 +577,7 @@ impl<'a> Beams<'a> {
 
     /// The part of a face that lies in a pixel; its outline is left in `polygon`.
     fn cut_to(&mut self, pixel: Area, outline: &Outline) -> Option<Piece> {
-        let Area { x0, y0, .. } = pixel;
+        let (x0, y0) = (pixel.x0(), pixel.y0());
         let (x0, y0) = (f64::from(x0), f64::from(y0));
         let (polygon, spare) = (&mut self.polygon, &mut self.spare);
         polygon.clear();
@@ -674,20 +677,21 @@ struct Piece {
 }
 
 impl Outline {
-    fn meets(&self, Area { x0, y0, width, height }: Area) -> bool {
-        self.low[0] < f64::from(x0 + width)
-            && self.high[0] > f64::from(x0)
-            && self.low[1] < f64::from(y0 + height)
-            && self.high[1] > f64::from(y0)
+    fn meets(&self, area: Area) -> bool {
+        let (columns, rows) = (area.columns(), area.rows());
+        self.low[0] < f64::from(columns.end)
+            && self.high[0] > f64::from(columns.start)
+            && self.low[1] < f64::from(rows.end)
+            && self.high[1] > f64::from(rows.start)
     }
 
     /// How much of a pixel the rectangle around the outline covers.
-    fn area_of_rectangle(&self, Area { x0, y0, .. }: Area) -> f64 {
+    fn area_of_rectangle(&self, pixel: Area) -> f64 {
         let length = |axis: usize, start: u32| {
             let start = f64::from(start);
             self.high[axis].min(start + 1.0) - self.low[axis].max(start)
         };
-        length(0, x0) * length(1, y0)
+        length(0, pixel.x0()) * length(1, pixel.y0())
     }
 }
 
@@ -773,24 +777,6 @@ fn shares(material: &MaterialRecord) -> Shares {
     Shares { own, other }
 }
 
-/// An area in blocks, row by row.
-pub(crate) fn blocks(area: Area, side: u32) -> impl Iterator<Item = Area> {
-    let Area { x0, y0, width, height } = area;
-    (0..height).step_by(side as usize).flat_map(move |y| {
-        (0..width).step_by(side as usize).map(move |x| Area {
-            x0: x0 + x,
-            y0: y0 + y,
-            width: side.min(width - x),
-            height: side.min(height - y),
-        })
-    })
-}
-
-/// The pixels of an area, row by row.
-fn pixels_of(Area { x0, y0, width, height }: Area) -> impl Iterator<Item = (u32, u32)> {
-    (y0..y0 + height).flat_map(move |y| (x0..x0 + width).map(move |x| (x, y)))
-}
-
 /// `base` to a whole power, by squaring.
 fn power(base: f64, exponent: u32) -> f64 {
     let (mut product, mut square, mut left) = (1.0, base, exponent);
@@ -866,12 +852,10 @@ mod tests {
     fn beams_meet_the_faces_that_they_meet_without_the_hierarchy() {
         let scene = clutter();
         let view = scene.view();
-        let mut beams = Beams::new(&view, Size::new(40, 30).unwrap(), false, 1.0).unwrap();
+        let size = Size::new(40, 30).unwrap();
+        let mut beams = Beams::new(&view, size, false, 1.0).unwrap();
         let mut total = 0;
-        for block in [1, 2, 8]
-            .into_iter()
-            .flat_map(|side| blocks(Area { x0: 0, y0: 0, width: 40, height: 30 }, side))
-        {
+        for block in [1, 2, 8].into_iter().flat_map(|side| Area::whole(size).blocks(side)) {
             for deepest in [0.7, 2.0, f64::INFINITY] {
                 assert!(beams.gather(block, deepest, usize::MAX));
                 let mut found: Vec<u32> = beams.outlines.iter().map(|face| face.rank).collect();
@@ -894,7 +878,7 @@ mod tests {
         let scene = clutter();
         let view = scene.view();
         let size = Size::new(40, 30).unwrap();
-        let whole = Area { x0: 0, y0: 0, width: 40, height: 30 };
+        let whole = Area::whole(size);
         let mut beams = Beams::new(&view, size, false, 1.0).unwrap();
         assert!(beams.gather(whole, f64::INFINITY, usize::MAX));
         let inside = |face: &Outline| {
@@ -909,8 +893,7 @@ mod tests {
                 let b = &corners[(k + 1) % corners.len()];
                 area += (a[0] * b[1] - a[1] * b[0]) / 2.0;
             }
-            let pieces = pixels_of(whole).filter_map(|(x0, y0)| {
-                let pixel = Area { x0, y0, width: 1, height: 1 };
+            let pieces = whole.blocks(1).filter_map(|pixel| {
                 face.meets(pixel).then(|| beams.cut_to(pixel, &face))?.map(|piece| piece.share)
             });
             let sum: f64 = pieces.sum();
