@@ -22,11 +22,11 @@ use std::{
 
 use rtfarm_core::{
     isa::Isa,
-    left_out::{self, BUILT_WITHOUT},
     prepare::prepare,
     prepared::{PreparedBytes, PreparedScene},
     read::read_scene,
     render::{Quality, Sampling, render_tile},
+    testing::{self, BUILT_WITHOUT},
     tile::{Area, Size},
 };
 
@@ -184,7 +184,7 @@ fn run_one(feature: usize, times: u32) {
 /// Builds this program without a feature's code, in a folder of its own, so that no other build is
 /// disturbed.
 fn build_without(feature: &str) -> PathBuf {
-    assert!(left_out::FEATURES.contains(&feature), "{feature} cannot be left out");
+    assert!(testing::FEATURES.contains(&feature), "{feature} cannot be left out");
     let folder = Path::new(env!("CARGO_TARGET_TMPDIR")).join("ablation");
     let output = Command::new(env!("CARGO"))
         .args(["bench", "-p", "rtfarm-core", "--bench", "ablation", "--no-run"])

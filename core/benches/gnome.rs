@@ -19,8 +19,8 @@ use rtfarm_core::{
     prepared::{PreparedBytes, PreparedScene},
     render::{Quality, Sampling, Settings, render_tile},
     scene::{Scene, Sphere, Viewport},
+    testing::{Probe, Probing},
     tile::{Area, Size},
-    trace::Probe,
 };
 
 const COUNTS: [usize; 5] = [1_000, 10_000, 100_000, 1_000_000, 4_000_000];

@@ -15,10 +15,11 @@ use std::{env, fs, ops::ControlFlow, path::Path, time::Instant};
 
 use rtfarm_core::{
     isa::Isa,
-    prepare::{prepare, prepare_unaimed},
+    prepare::prepare,
     prepared::{PreparedBytes, PreparedScene},
     read::read_scene,
     render::{Quality, RenderedTile, Sampling, Settings, render_tile},
+    testing::prepare_unaimed,
     tile::{Area, Size},
 };
 

@@ -6,7 +6,7 @@
 // What every room may speak of.
 mod exact;
 pub mod isa;
-pub mod left_out;
+mod left_out;
 pub mod sample;
 pub mod scene;
 mod text;
@@ -25,7 +25,10 @@ pub mod prepared;
 mod light;
 pub mod render;
 mod shade;
-pub mod trace;
+mod trace;
+
+#[doc(hidden)]
+pub mod testing;
 
 pub use assets::{mesh as mesh_file, texture};
 pub use language::reader as read;

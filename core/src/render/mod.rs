@@ -15,10 +15,11 @@ use std::ops::ControlFlow;
 
 use self::sampler::Sampler;
 
+use crate::{isa::Isa, prepared::PreparedScene, tile::Area};
+
 pub use self::settings::{
     Cutoff, Quality, SampleCount, SampleLimit, Sampling, Settings, StandardError,
 };
-use crate::{isa::Isa, prepared::PreparedScene, tile::Area};
 
 /// A rendered tile.
 #[derive(Debug, Clone, PartialEq)]

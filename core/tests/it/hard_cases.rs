@@ -9,8 +9,8 @@ use rtfarm_core::{
     isa::Isa,
     prepared::{PreparedBytes, PreparedScene},
     scene::{Quadrangle, Scene, Sphere},
+    testing::{Probe, Probing},
     tile::Area,
-    trace::Probe,
 };
 use rtfarm_oracle::{
     Oracle,
@@ -626,7 +626,7 @@ fn starts_on(ball: &Ball, random: &mut Random, count: usize, ahead: f64) -> Vec<
         })
         .collect();
     let hits = ball.block.probe(&outside, Isa::fastest());
-    let start = |(probe, hit): (&Probe, Option<rtfarm_core::trace::ProbeHit>)| {
+    let start = |(probe, hit): (&Probe, Option<rtfarm_core::testing::ProbeHit>)| {
         let hit = hit.expect("a ray at the middle of a ball");
         let origin = probe.origin + hit.t * probe.direction;
         let outward = (origin - ball.center).normalize();

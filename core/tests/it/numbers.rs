@@ -10,7 +10,7 @@ use rtfarm_core::{
     read::{Severity, read_scene},
     render::{Settings, render_tile},
     scene::{Quadrangle, Scene, Sphere, Triangle},
-    trace::{Probe, ProbeHit},
+    testing::{Probe, ProbeHit, Probing},
 };
 use rtfarm_oracle::{
     Oracle,

@@ -12,7 +12,7 @@ use rtfarm_core::{
     prepared::{PreparedBytes, PreparedScene},
     read::read_scene,
     scene::Scene,
-    trace::{Probe, ProbeHit},
+    testing::{Probe, ProbeHit, Probing},
 };
 use rtfarm_oracle::{
     Oracle,
