@@ -8,7 +8,7 @@ use crate::{
     prepared::{layout::View, record::Features},
     sample::Sample,
     shade::{
-        point::{Point, surface_color},
+        point::{Interaction, Point},
         ray_differential::Patch,
     },
     trace::{
@@ -135,8 +135,7 @@ impl Gatherer {
             };
             let weight = seeker.share * (material.reflect * material.alpha) / density;
             if weight > 0.0 {
-                let outward = hit.face.normal(view, position);
-                let is_front = outward.dot(ray.direction) <= 0.0;
+                let at = Interaction::new(view, ray, hit);
                 // A texture's truth: a mean over all samples needs no coarser level.
                 let finest = Some(Patch::POINT);
                 self.sources.push(Point {
@@ -144,9 +143,9 @@ impl Gatherer {
                     node: 0,
                     weight,
                     position,
-                    normal: if is_front { outward } else { -outward },
+                    normal: at.normal,
                     surface,
-                    color: surface_color(view, material, hit, (position, outward), finest),
+                    color: at.color(view, finest),
                     light: view.header.lighting.ambient(),
                 });
             }

@@ -5,11 +5,11 @@ use std::ops::ControlFlow;
 use glam::DVec3;
 
 use super::{
-    Tally,
     pixel::Pixel,
     settings::{Quality, Sampling},
+    tally::Tally,
     unseen::{Beams, Look, Unseen},
-    wavefront::{Batch, CameraSample},
+    wavefront::{CameraSample, Wavefront},
 };
 use crate::{
     isa::Isa,
@@ -28,7 +28,7 @@ pub(super) struct Sampler<'a> {
     quality: &'a Quality,
     isa: Isa,
     on_progress: &'a mut dyn FnMut() -> ControlFlow<()>,
-    batch: Batch,
+    wavefront: Wavefront,
     tally: Tally,
 }
 
@@ -39,8 +39,8 @@ impl<'a> Sampler<'a> {
         isa: Isa,
         on_progress: &'a mut dyn FnMut() -> ControlFlow<()>,
     ) -> Self {
-        let (batch, tally) = (Batch::default(), Tally::default());
-        Self { view, quality, isa, on_progress, batch, tally }
+        let (wavefront, tally) = (Wavefront::default(), Tally::default());
+        Self { view, quality, isa, on_progress, wavefront, tally }
     }
 
     /// What the work has taken so far.
@@ -161,7 +161,7 @@ impl<'a> Sampler<'a> {
         let each = u64::from(count - had);
         let wanted = chosen.len() as u64 * each;
         let pixel_of = |index: u64| chosen[(index / each) as usize];
-        let spread = 1.0 / f64::from(count).sqrt();
+        let width = 1.0 / f64::from(count).sqrt();
         for first in (0..wanted).step_by(BATCH) {
             let run = first..wanted.min(first + BATCH as u64);
             let samples = run.clone().map(|index| {
@@ -169,20 +169,19 @@ impl<'a> Sampler<'a> {
                 let (x, y) = area.pixel_at(pixel);
                 let number = had + (index % each) as u32;
                 let sample = Samples::new(count, seed, x, y).sample(number);
-                CameraSample { x, y, sample, spread }
+                CameraSample { x, y, sample, width }
             });
-            self.batch.start(self.view, self.quality, area.frame(), samples);
+            self.wavefront.start(self.view, self.quality, area.frame(), samples);
             self.tally.samples += run.end - run.start;
             self.tally.rays +=
-                self.batch.run(self.view, self.quality, self.isa, self.on_progress)?;
-            for (index, &color) in run.zip(&self.batch.colors) {
+                self.wavefront.run(self.view, self.quality, self.isa, self.on_progress)?;
+            for (index, &color) in run.zip(self.wavefront.colors()) {
                 pixels[pixel_of(index) as usize].add(color);
             }
             if let Some(hits) = &mut hits {
-                hits.extend_from_slice(&self.batch.first_hits);
+                hits.extend_from_slice(self.wavefront.first_hits());
             }
-            let cut = self.batch.cut.iter().copied();
-            self.tally.cut = cut.fold(self.tally.cut, f64::max);
+            self.tally.cut = self.tally.cut.max(self.wavefront.most_untraced());
         }
         ControlFlow::Continue(())
     }

@@ -3,12 +3,10 @@
 use glam::{DVec2, DVec3};
 
 use super::{chart::Chart, ray_differential::Patch};
-use crate::{
-    prepared::{
-        layout::View,
-        record::{LevelRecord, TexturedFace},
-    },
-    trace::ray::Hit,
+use crate::prepared::{
+    face::Face,
+    layout::View,
+    record::{LevelRecord, TexturedFace},
 };
 
 /// The most probes along a footprint's longer axis, and so how much longer than wide a footprint
@@ -31,16 +29,17 @@ pub(crate) struct Footprint {
 pub(crate) fn texture_color(
     view: &View<'_>,
     texture: u32,
-    hit: &Hit,
+    face: Face,
+    rank: u32,
     (position, outward): (DVec3, DVec3),
     patch: Patch,
 ) -> DVec3 {
     let faces = view.textured_faces;
-    let Ok(face) = faces.binary_search_by_key(&hit.rank, |face| face.rank) else {
+    let Ok(index) = faces.binary_search_by_key(&rank, |face| face.rank) else {
         return DVec3::ONE;
     };
-    let TexturedFace { texcoords, .. } = faces[face];
-    let Some(polygon) = hit.face.polygon(view) else { return DVec3::ONE };
+    let TexturedFace { texcoords, .. } = faces[index];
+    let Some(polygon) = face.polygon(view) else { return DVec3::ONE };
     let chart = Chart::new(polygon.corners(), outward);
     let place = chart.place(position);
     let footprint = Footprint {

@@ -4,8 +4,9 @@
 //! it depends neither on the tree nor on the instruction set.
 
 use super::{
-    boxes::{BoxKernel, KernelWork, run_with_kernel},
+    boxes::{BoxKernel, KernelWork},
     hit::{Nearest, between},
+    kernels::run_with_kernel,
     ray::{Hit, Ray, Shear},
     solid::Scratch,
     traversal::{Stack, Step, visit},

@@ -5,7 +5,8 @@ mod boxes;
 #[cfg(target_arch = "x86_64")]
 #[expect(unsafe_code, reason = "SIMD intrinsics")]
 mod boxes_x86;
-pub(crate) mod hit;
+mod hit;
+mod kernels;
 pub(crate) mod probe;
 pub(crate) mod quadrangle;
 pub(crate) mod ray;
