@@ -2,7 +2,10 @@
 //! only now and then, and where the ray meets such a face, that place is lit in its turn and gives
 //! what it can.
 
-use super::sampling::{self, Aim, Receiver};
+use super::{
+    importance::Receiver,
+    sampling::{self, Aim},
+};
 use crate::{
     isa::Isa,
     prepared::{layout::View, record::Features},

@@ -8,7 +8,10 @@ use std::f64::consts::{FRAC_PI_4, PI};
 
 use glam::DVec3;
 
-use super::tree::Survey;
+use super::{
+    importance::{FULL_SHARE, Promise, Receiver, SPHERE_CONTACT, corners},
+    tree::Survey,
+};
 use crate::{
     prepared::{
         layout::View,
@@ -16,27 +19,6 @@ use crate::{
     },
     sample::GatherNumbers,
 };
-
-/// A place on a surface that receives light.
-#[derive(Debug, Clone, Copy)]
-pub(crate) struct Receiver {
-    pub(crate) position: DVec3,
-    /// Of length 1, towards the side that receives.
-    pub(crate) normal: DVec3,
-}
-
-/// How much an emitter, or a group of them, may give a receiver: what it pays to aim at, and what
-/// rays over the whole sky find as well.
-#[derive(Debug, Clone, Copy, Default)]
-pub(crate) struct Promise {
-    /// About how much of the receiver's cosine-weighted sky it covers: 0..=1.
-    pub(crate) share: f64,
-    /// About how much light comes from what it pays to aim at: its share times what it sends on
-    /// at most.
-    pub(crate) light: f64,
-    /// The mean square of what a ray of the whole sky brings from the rest.
-    pub(crate) square: f64,
-}
 
 /// A direction in which to look for light.
 #[derive(Debug, Clone, Copy)]
@@ -54,10 +36,6 @@ pub(crate) struct Aim {
 /// The least probability with which the whole sky is sampled. It bounds what one ray may bring by
 /// its inverse, for emitters that the estimates here overlook.
 const LEAST_SKY: f64 = 0.05;
-
-/// The share of the sky from which on emitters fill it so far that choosing among them is no
-/// gain.
-pub(crate) const FULL_SHARE: f64 = 0.5;
 
 /// The probability with which the whole sky is sampled above which it is sampled always.
 const MOST_SKY: f64 = 0.6;
@@ -176,9 +154,6 @@ fn cone(emitter: &EmitterRecord, receiver: &Receiver) -> Option<Cone> {
     Some(Cone { axis: to_center / distance, height: sine * sine / (1.0 + cosine) })
 }
 
-/// How near to a sphere, in its distance, it is no longer aimed at.
-const SPHERE_CONTACT: f64 = 1e-6;
-
 /// Uniform in the cone in which the sphere is seen.
 fn toward_sphere(emitter: &EmitterRecord, receiver: &Receiver, numbers: [f64; 2]) -> Option<DVec3> {
     let Cone { axis, height } = cone(emitter, receiver)?;
@@ -204,11 +179,6 @@ fn toward_polygon(
     (distance > 0.0).then(|| (to_place / distance, distance))
 }
 
-/// The corners of a polygon; of a triangle the last two are one.
-fn corners(view: &View<'_>, emitter: &EmitterRecord) -> [DVec3; 4] {
-    emitter.vertices.map(|vertex| DVec3::from_array(view.vertices[vertex as usize]))
-}
-
 /// A place uniform on a polygon that its diagonal from the first corner cuts in two triangles.
 ///
 /// Source: Heitz, "A Low-Distortion Map Between Triangle and Square" (2019).
@@ -221,78 +191,6 @@ fn on_polygon(corners: &[DVec3; 4], [u, v]: [f64; 2]) -> DVec3 {
     let (s, t) = if v > u { (u * 0.5, v - u * 0.5) } else { (u - v * 0.5, v * 0.5) };
     corners[0] + s * b + t * c
 }
-
-/// What an emitter promises a receiver.
-pub(crate) fn promise(view: &View<'_>, emitter: &EmitterRecord, receiver: &Receiver) -> Promise {
-    if !emitter.is_sphere() {
-        return polygon_promise(view, emitter, receiver);
-    }
-    let [radiosity, _] = emitter.radiosity;
-    let to_center = DVec3::from_array(emitter.middle) - receiver.position;
-    let distance = to_center.length();
-    if distance - emitter.size <= distance * SPHERE_CONTACT {
-        // All around, if it is there.
-        return Promise { share: 1.0, light: 0.0, square: radiosity * radiosity };
-    }
-    let cosine = receiver.normal.dot(to_center) / distance;
-    let share = sphere_share(cosine, emitter.size / distance);
-    Promise { share, light: share * radiosity, square: 0.0 }
-}
-
-/// About the share of the sky that a sphere covers whose centre is seen under an angle of this
-/// cosine, with its radius over its distance, 0..=1. Exact but where the horizon cuts it.
-pub(crate) fn sphere_share(cosine: f64, sine: f64) -> f64 {
-    if cosine >= sine {
-        return cosine * (sine * sine);
-    }
-    let above = (cosine + sine).max(0.0);
-    0.25 * sine * (above * above)
-}
-
-/// What a polygon promises. A near one, compared with its size, that covers much is left to the
-/// whole sky: its places are chosen by area, and of those next to the receiver that chooses too few.
-fn polygon_promise(view: &View<'_>, emitter: &EmitterRecord, receiver: &Receiver) -> Promise {
-    let middle = DVec3::from_array(emitter.middle) - receiver.position;
-    let toward = DVec3::from_array(emitter.turned_area).dot(middle);
-    let radiosity = emitter.radiosity[usize::from(toward > 0.0)];
-    let squared = middle.length_squared();
-    // The share of the sky that a disc of its area covers at the best angle: 0..=1.
-    let nearness = emitter.size / (emitter.size + PI * squared);
-    let is_far = (NEAR - nearness).clamp(0.0, NEAR - FAR) / (NEAR - FAR);
-    // About it at this angle.
-    let mut share = nearness * toward.abs() / (emitter.size * squared.sqrt());
-    if is_far > 0.0 || share < 2.0 * SMALL {
-        // A part at each corner, as a disc.
-        let all = corners(view, emitter).map(|corner| corner - receiver.position);
-        let corners = if emitter.is_triangle() { &all[..3] } else { &all[..] };
-        let part = emitter.size / corners.len() as f64;
-        let mut sum = 0.0;
-        for &corner in corners {
-            let place = 0.5 * (middle + corner);
-            let height = receiver.normal.dot(place);
-            if height > 0.0 {
-                let squared = place.length_squared();
-                sum += height / (squared * (PI * squared + part));
-            }
-        }
-        share = toward.abs() * sum / corners.len() as f64;
-    }
-    // `min` makes a number of 0/0.
-    let share = share.min(1.0);
-    // Rays of the whole sky seldom find a small one, however near.
-    let aimed = is_far.max(((2.0 * SMALL - share) / SMALL).min(1.0));
-    let square = share * (1.0 - aimed) * (radiosity * radiosity);
-    Promise { share, light: share * aimed * radiosity, square }
-}
-
-/// From this nearness on a polygon is not aimed at.
-const NEAR: f64 = 0.3;
-
-/// Up to this nearness it is left to aiming alone.
-const FAR: f64 = 0.05;
-
-/// A share of the sky that is small; twice of it is not.
-const SMALL: f64 = 0.05;
 
 /// A place uniform in the unit disc by a place in the unit square.
 ///

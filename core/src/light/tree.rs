@@ -4,9 +4,7 @@
 //! (2018). Here the nearest few nodes are opened at every receiver, which also tells how far
 //! emitters fill its sky; below them one path is walked at random.
 
-use glam::DVec3;
-
-use super::sampling::{FULL_SHARE, Promise, Receiver, promise, sphere_share};
+use super::importance::{FULL_SHARE, Promise, Receiver, node_promise, promise};
 use crate::prepared::{
     layout::View,
     record::{EmitterNode, NO_NODE},
@@ -145,21 +143,4 @@ impl Survey {
 
 fn children_light(view: &View<'_>, receiver: &Receiver, node: &EmitterNode) -> [f64; 2] {
     [node.child, node.child + 1].map(|child| node_promise(view, receiver, child).light)
-}
-
-/// What all emitters of a node promise: that of a ball around them that they fill in part.
-fn node_promise(view: &View<'_>, receiver: &Receiver, index: u32) -> Promise {
-    let node = &view.emitter_nodes[index as usize];
-    if node.is_leaf() {
-        return promise(view, &view.emitters[node.emitter as usize], receiver);
-    }
-    let to_center = DVec3::from_array(node.center) - receiver.position;
-    let distance = to_center.length();
-    let whole = if distance > node.radius {
-        sphere_share(receiver.normal.dot(to_center) / distance, node.radius / distance)
-    } else {
-        1.0
-    };
-    let share = whole * node.fill;
-    Promise { share, light: share * node.radiosity, square: 0.0 }
 }
