@@ -17,7 +17,7 @@ pub use self::settings::{
 use std::ops::ControlFlow;
 
 use self::pixel::Pixel;
-use self::unseen::{Beams, Look, Unseen};
+use self::unseen::{FirstSamples, UnseenFaces, UnseenSearch};
 use self::wavefront::{Batch, CameraSample};
 
 use glam::DVec3;
@@ -157,7 +157,7 @@ impl<'a> Sampler<'a> {
             pixels[pixel as usize].set_contrast(contrast);
         }
         let quality = &self.settings.quality;
-        let beams = Beams::new(self.view, self.settings.size, quality.flat, error);
+        let beams = UnseenSearch::new(self.view, self.settings.size, quality.flat, error);
         let mut hidden = match beams {
             Some(beams) => self.find_hidden(beams, area, wide, &mut pixels, &hits)?,
             None => Hidden::default(),
@@ -180,7 +180,7 @@ impl<'a> Sampler<'a> {
     /// Finds what may hide in the pixels of `area`, from the first samples of `wide`.
     fn find_hidden(
         &mut self,
-        mut beams: Beams<'a>,
+        mut beams: UnseenSearch<'a>,
         area: Area,
         wide: Area,
         pixels: &mut [Pixel],
@@ -193,7 +193,7 @@ impl<'a> Sampler<'a> {
             let look = |x: u32, y: u32| {
                 let pixel = index_of(wide, x, y);
                 let first = pixel as usize * FEWEST_FOR_ERROR as usize;
-                Look {
+                FirstSamples {
                     hits: &hits[first..first + FEWEST_FOR_ERROR as usize],
                     samples: Samples::new(FEWEST_FOR_ERROR, seed, x, y),
                     mean: pixels[pixel as usize].mean(),
@@ -254,9 +254,9 @@ impl<'a> Sampler<'a> {
 /// What may hide in pixels.
 #[derive(Default)]
 struct Hidden<'a> {
-    beams: Option<Beams<'a>>,
+    beams: Option<UnseenSearch<'a>>,
     /// Pixels, by how many of their samples they are up to, and what none of those passed.
-    found: Vec<(u32, u32, Unseen)>,
+    found: Vec<(u32, u32, UnseenFaces)>,
 }
 
 impl Hidden<'_> {
@@ -271,7 +271,7 @@ impl Hidden<'_> {
                 continue;
             }
             let places = (*had..pixel.count()).map(|number| samples.sample(number).place(x, y));
-            beams.pass(unseen, places, pixel.count());
+            beams.note_samples(unseen, places, pixel.count());
             *had = pixel.count();
             pixel.set_hidden(unseen.variance(*had));
         }
