@@ -12,7 +12,7 @@ use crate::{
     sample::Sample,
     shade::{
         point::{Point, surface_color},
-        ray_differential::Patch,
+        ray_differential::SurfaceFootprint,
     },
     trace::{
         batch::trace,
@@ -156,7 +156,7 @@ impl Gatherer {
                 let outward = hit.face.normal(view, position);
                 let is_front = outward.dot(ray.direction) <= 0.0;
                 // The finest level is the truth: a mean over all samples needs no coarser one.
-                let finest = Some(Patch::POINT);
+                let finest = Some(SurfaceFootprint::POINT);
                 self.sources.push(Point {
                     sample: path.point,
                     node: 0,

@@ -18,7 +18,7 @@ use crate::{
     shade::{
         optics::{mirror, refract},
         point::{Point, surface_color},
-        ray_differential::Spread,
+        ray_differential::RayDifferential,
     },
     trace::{
         batch::{trace, trace_shadows},
@@ -51,7 +51,7 @@ pub(crate) struct Batch {
     rays: Vec<Ray>,
     branches: Vec<Branch>,
     /// What each ray's sample is wide; empty in a scene without textures.
-    spreads: Vec<Spread>,
+    spreads: Vec<RayDifferential>,
     hits: Vec<Hit>,
     points: Vec<Point>,
     shadow_rays: Vec<Ray>,
@@ -61,7 +61,7 @@ pub(crate) struct Batch {
     next_rays: Vec<Ray>,
     next_branches: Vec<Branch>,
     gatherer: Gatherer,
-    next_spreads: Vec<Spread>,
+    next_spreads: Vec<RayDifferential>,
     /// What each camera ray met.
     pub(crate) first_hits: Vec<Hit>,
     /// What each sample sees.
@@ -106,7 +106,7 @@ impl Batch {
             if has_textures {
                 let steps = [(1, size.width()), (2, size.height())]
                     .map(|(side, count)| screen[side] * (spread / f64::from(count)));
-                self.spreads.push(Spread::of_camera(direction, steps));
+                self.spreads.push(RayDifferential::of_camera(direction, steps));
             }
             Ray {
                 origin: DVec3::from_array(camera.eye),
@@ -203,7 +203,7 @@ impl Batch {
         let spread =
             HAS_TEXTURES.then(|| self.spreads[index].transfer(ray.direction, hit.t, normal));
         if reflect < 1.0 && alpha > 0.0 {
-            let patch = spread.map(|spread| spread.patch(ray.direction, normal));
+            let footprint = spread.map(|spread| spread.footprint(ray.direction, normal));
             self.points.push(Point {
                 sample,
                 node,
@@ -211,29 +211,32 @@ impl Batch {
                 position,
                 normal,
                 surface,
-                color: surface_color(view, material, hit, (position, outward), patch),
+                color: surface_color(view, material, hit, (position, outward), footprint),
                 light: view.header.lighting.ambient(),
             });
         }
         if !view.header.features.has_branches() {
             return;
         }
-        let mut follow =
-            |direction: DVec3, after: u32, weight: f64, branch: u64, spread: Option<Spread>| {
-                if weight < cutoff || depth == DEEPEST {
-                    self.cut[sample] += weight;
-                    return;
-                }
-                self.next_rays.push(Ray {
-                    origin: position,
-                    direction,
-                    reach: f64::INFINITY,
-                    leaving: surface,
-                    after,
-                });
-                self.next_branches.push(Branch { sample, weight, node: node_after(node, branch) });
-                self.next_spreads.extend(spread);
-            };
+        let mut follow = |direction: DVec3,
+                          after: u32,
+                          weight: f64,
+                          branch: u64,
+                          spread: Option<RayDifferential>| {
+            if weight < cutoff || depth == DEEPEST {
+                self.cut[sample] += weight;
+                return;
+            }
+            self.next_rays.push(Ray {
+                origin: position,
+                direction,
+                reach: f64::INFINITY,
+                leaving: surface,
+                after,
+            });
+            self.next_branches.push(Branch { sample, weight, node: node_after(node, branch) });
+            self.next_spreads.extend(spread);
+        };
         let cosine = -normal.dot(ray.direction);
         let mirrored = mirror(ray.direction, normal, cosine);
         let curvature =
@@ -254,8 +257,9 @@ impl Batch {
             };
             match bent {
                 Some(direction) => {
-                    let refract =
-                        |spread: Spread| spread.refract(ray.direction, normal, curvature, ratio);
+                    let refract = |spread: RayDifferential| {
+                        spread.refract(ray.direction, normal, curvature, ratio)
+                    };
                     let bent = if is_straight { spread } else { spread.map(refract) };
                     follow(direction, hit.rank, weight, 2, bent);
                 }

@@ -2,7 +2,7 @@
 
 use glam::DVec3;
 
-use super::{ray_differential::Patch, texture::texture_color};
+use super::{ray_differential::SurfaceFootprint, texture::texture_color};
 use crate::{
     left_out,
     prepared::{
@@ -29,7 +29,7 @@ pub(crate) struct Point {
     pub(crate) light: DVec3,
 }
 
-/// The colour of a face at a hit, its texture included, of which the sample sees `patch`. There is
+/// The colour of a face at a hit, its texture included, of which the sample sees `footprint`. There is
 /// none in a scene without textures.
 #[inline(always)]
 pub(crate) fn surface_color(
@@ -37,12 +37,12 @@ pub(crate) fn surface_color(
     material: &MaterialRecord,
     hit: &Hit,
     at: (DVec3, DVec3),
-    patch: Option<Patch>,
+    footprint: Option<SurfaceFootprint>,
 ) -> DVec3 {
     let color = DVec3::from_array(material.color);
-    match patch {
-        Some(patch) if material.texture != MaterialRecord::PLAIN && !left_out::TEXTURE => {
-            color * texture_color(view, material.texture, hit, at, patch)
+    match footprint {
+        Some(footprint) if material.texture != MaterialRecord::PLAIN && !left_out::TEXTURE => {
+            color * texture_color(view, material.texture, hit, at, footprint)
         }
         _ => color,
     }
