@@ -25,7 +25,7 @@ use rtfarm_core::{
     prepare::prepare,
     prepared::{PreparedBytes, PreparedScene},
     read::{draw_diagnostics, read_scene},
-    render::{Quality, Sampling, Settings, render_tile},
+    render::{Quality, Sampling, render_tile},
     tile::{Area, Size},
 };
 use rtfarm_oracle::known_pictures::{indirect_pictures, known_pictures, known_size};
@@ -243,7 +243,13 @@ async fn own_subject(
     let count = plan.reference;
     let stop = stop.clone();
     let rendering = spawn_blocking(move || {
-        let truth = render_rows(&prepared, size, Sampling::Fixed(count), u64::MAX, &stop)?;
+        let truth = render_rows(
+            &prepared,
+            size,
+            Sampling::fixed(count).expect("a plan's number"),
+            u64::MAX,
+            &stop,
+        )?;
         let truth = truth.iter().map(|pixel| pixel.map(f64::from)).collect();
         let truth = Truth::new(truth, size);
         Some(Subject {
@@ -265,13 +271,13 @@ fn render_rows(
     stop: &CancellationToken,
 ) -> Option<Vec<[f32; 3]>> {
     use rayon::prelude::*;
-    let settings = Settings { size, quality: Quality { sampling, seed, ..Quality::default() } };
+    let quality = Quality { sampling, seed, ..Quality::default() };
     let rows: Option<Vec<Vec<[f32; 3]>>> = (0..size.height())
         .into_par_iter()
         .map(|y0| {
-            let area = Area { x0: 0, y0, width: size.width(), height: 1 };
+            let area = Area::new(size, [0, y0], [size.width(), 1]).expect("a row of the frame");
             let go_on = &mut || ladder::go_on(stop);
-            Some(render_tile(scene, &settings, area, Isa::fastest(), go_on)?.pixels)
+            Some(render_tile(scene, &quality, area, Isa::fastest(), go_on)?.pixels)
         })
         .collect();
     rows.map(|rows| rows.concat())

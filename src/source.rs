@@ -9,11 +9,10 @@ use std::{
 
 use anyhow::Context;
 use memmap2::Mmap;
-use rtfarm_coordinator::folder_of;
 use tokio::task::spawn_blocking;
 use tokio_util::sync::CancellationToken;
 
-use crate::{args::SceneArgs, failure::Failure};
+use crate::{args::SceneArgs, failure::Failure, output::folder_of};
 
 /// From here on a copy would count.
 const LONG: u64 = 16 << 20;

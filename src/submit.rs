@@ -10,8 +10,8 @@ use std::{
 };
 
 use anyhow::{Context, anyhow};
-use rtfarm_coordinator::{Progress, Wish};
 use rtfarm_core::{read::read_scene, tile::Size};
+use rtfarm_job::{Progress, RenderRequest};
 use rtfarm_proto::{
     CHUNK_BYTES, MESSAGE_BYTES, PROTOCOL,
     wire::{self, event, jobs_client::JobsClient, submit_request::Part, submit_response::Outcome},
@@ -73,7 +73,7 @@ pub(crate) async fn run(
     let (event, rendering) = rendered?;
     let tally = event.tally.unwrap_or_default().try_into()?;
     let workers = event.workers as usize;
-    let Wish { quality, transfer, .. } = args.picture.wish(output.format());
+    let RenderRequest { quality, transfer, .. } = args.picture.request(output.format());
     let sampling = quality.sampling;
     Summary { size, tally, sampling, transfer, rendering, workers }.tell(started, &output)?;
     Ok(())
@@ -86,17 +86,17 @@ async fn submit(
     text: SceneText,
     console: &Console,
 ) -> Result<wire::Accepted, Failure> {
-    let wish = args.picture.wish(output.format());
+    let request = args.picture.request(output.format());
     let order = wire::Order {
         version: VERSION.to_owned(),
         protocol: PROTOCOL,
-        name: wish.name.clone(),
-        frame: wish.size.map(Into::into),
-        quality: Some(wish.quality.into()),
-        strict: wish.strict,
-        tile_side: wish.tile_side.map_or(0, |side| side as u32),
-        format: wire::Format::from(wish.format).into(),
-        transfer: wire::Transfer::from(wish.transfer).into(),
+        name: request.name.clone(),
+        frame: request.size.map(Into::into),
+        quality: Some(request.quality.into()),
+        strict: request.strict,
+        tile_side: request.tile_side.map_or(0, |side| side as u32),
+        format: wire::Format::from(request.format).into(),
+        transfer: wire::Transfer::from(request.transfer).into(),
     };
     let folder = scene_folder(&args.picture.scene);
     let (text, files) = spawn_blocking(move || {
@@ -130,7 +130,7 @@ async fn submit(
         Some(Outcome::Accepted(accepted)) => Ok(accepted),
         Some(Outcome::Refused(reason)) if reason.is_empty() => Err(Failure::Told),
         Some(Outcome::Refused(reason)) => {
-            Err(Failure::Input(anyhow!("the farm cannot render {}: {reason}", wish.name)))
+            Err(Failure::Input(anyhow!("the farm cannot render {}: {reason}", request.name)))
         }
         None => Err(Failure::Other(anyhow!("the coordinator's answer makes no sense"))),
     }

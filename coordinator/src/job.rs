@@ -1,12 +1,10 @@
 //! A job: its scene, its picture, how far it is.
 
-use std::{collections::BTreeSet, time::Duration};
+use std::{collections::BTreeSet, sync::Mutex};
 
-use rtfarm_core::{
-    picture::Picture,
-    render::{Settings, Tally},
-    tile::TileGrid,
-};
+use rtfarm_core::{render::Settings, tile::TileGrid};
+use rtfarm_job::{Outcome, Progress};
+use rtfarm_picture::Picture;
 use rtfarm_proto::{JobId, WorkerId};
 use tokio::{sync::watch, time::Instant};
 
@@ -23,32 +21,8 @@ pub struct Job {
     pub(crate) picture: Picture,
     pub(crate) started: Instant,
     pub(crate) progress: watch::Sender<Progress>,
-}
-
-/// How far a job is.
-#[derive(Debug, Clone, Default)]
-pub struct Progress {
-    /// Tiles in the picture.
-    pub tiles_done: u32,
-    /// Tiles of the picture.
-    pub tile_count: u32,
-    /// What the tiles in the picture took.
-    pub tally: Tally,
-    /// Workers that brought some of them.
-    pub workers: BTreeSet<WorkerId>,
-    /// Tiles of which two copies differed.
-    pub differing_tiles: u32,
-    /// How it ended, once it has.
-    pub end: Option<End>,
-}
-
-/// How a job ended.
-#[derive(Debug, Clone, PartialEq)]
-pub enum End {
-    /// Every tile is in the picture, after that time.
-    Finished(Duration),
-    /// It will never be.
-    Failed(String),
+    /// Those that have brought a tile.
+    pub(crate) workers: Mutex<BTreeSet<WorkerId>>,
 }
 
 impl Job {
@@ -67,11 +41,16 @@ impl Job {
         self.progress.subscribe()
     }
 
+    /// Notes that `worker` has brought a tile; says whether it is its first.
+    pub(crate) fn note_worker(&self, worker: WorkerId) -> bool {
+        self.workers.lock().expect("a set never panics").insert(worker)
+    }
+
     /// Ends the job, unless it has ended; says whether it had not.
-    pub(crate) fn end(&self, end: End) -> bool {
+    pub(crate) fn end(&self, outcome: Outcome) -> bool {
         self.progress.send_if_modified(|progress| {
-            let is_first = progress.end.is_none();
-            progress.end.get_or_insert(end);
+            let is_first = progress.outcome.is_none();
+            progress.outcome.get_or_insert(outcome);
             is_first
         })
     }

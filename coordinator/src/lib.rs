@@ -6,14 +6,9 @@
 mod job;
 mod jobs;
 mod lease;
-mod log;
-mod order;
 mod run;
 mod service;
 mod store;
 
-pub use job::{End, Job, Progress};
-pub use log::{TileCost, log_tile};
-pub use order::{MOST_TILES, Order, Placed, Refusal, Wish};
+pub use job::Job;
 pub use run::{Config, Coordinator, Listener, SubmitError};
-pub use store::{folder_of, new_picture};

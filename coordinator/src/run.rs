@@ -9,6 +9,8 @@ use std::{
 };
 
 use rtfarm_core::tile::TileId;
+use rtfarm_job::{Order, Outcome, Progress};
+use rtfarm_picture::Picture;
 use rtfarm_proto::{JobId, WorkerId};
 use tokio::{
     net::{TcpListener, UnixListener},
@@ -19,14 +21,7 @@ use tokio_stream::wrappers::{TcpListenerStream, UnixListenerStream};
 use tokio_util::sync::CancellationToken;
 use tonic::transport::server::Router;
 
-use crate::{
-    job::{End, Job, Progress},
-    jobs::Jobs,
-    lease::Loss,
-    order::Order,
-    service,
-    store::{SceneFile, new_picture},
-};
+use crate::{job::Job, jobs::Jobs, lease::Loss, service, store::SceneFile};
 
 /// How a coordinator works.
 #[derive(Debug, Clone)]
@@ -112,14 +107,16 @@ impl Coordinator {
         let scene = SceneFile::write(scene_folder, &prepared)
             .map_err(|error| SubmitError::Scene(scene_folder.clone(), error))?;
         drop(prepared);
-        let picture = new_picture(picture_folder, settings.size, format, transfer)
+        let picture = Picture::new_in(picture_folder, settings.size, format, transfer)
             .map_err(|error| SubmitError::Picture(picture_folder.clone(), error))?;
 
         let id = self.shared.jobs().number_job();
         let progress =
             watch::Sender::new(Progress { tile_count: grid.count(), ..Progress::default() });
         let started = Instant::now();
-        let job = Arc::new(Job { id, name, scene, settings, grid, picture, started, progress });
+        let workers = Mutex::default();
+        let job =
+            Arc::new(Job { id, name, scene, settings, grid, picture, started, progress, workers });
         self.shared.keep(&job);
         tracing::info!(
             job = id.0,
@@ -143,7 +140,7 @@ impl Coordinator {
         self.shared.jobs().on_end(job);
         let forgotten = self.shared.kept().remove(&job);
         if let Some(job) = forgotten
-            && job.end(End::Failed("it was cancelled".to_owned()))
+            && job.end(Outcome::Failed("it was cancelled".to_owned()))
         {
             tracing::info!(job = job.id.0, "job cancelled");
         }
@@ -231,7 +228,7 @@ impl Shared {
         let mut kept = self.kept();
         let ended: Vec<JobId> = kept
             .iter()
-            .filter(|(_, job)| job.progress.borrow().end.is_some())
+            .filter(|(_, job)| job.progress.borrow().outcome.is_some())
             .map(|(&id, _)| id)
             .collect();
         for old in ended.iter().take(ended.len().saturating_sub(KEPT_AFTER_END)) {
@@ -241,12 +238,12 @@ impl Shared {
     }
 
     /// Ends a job, unless it has ended.
-    pub(crate) fn end(&self, job: JobId, end: End) {
+    pub(crate) fn end(&self, job: JobId, outcome: Outcome) {
         self.jobs().on_end(job);
         if let Some(job) = self.job(job) {
             let reason =
-                if let End::Failed(reason) = &end { reason.clone() } else { String::new() };
-            if job.end(end) && !reason.is_empty() {
+                if let Outcome::Failed(reason) = &outcome { reason.clone() } else { String::new() };
+            if job.end(outcome) && !reason.is_empty() {
                 tracing::warn!(job = job.id.0, reason, "job failed");
             }
         }
@@ -254,7 +251,7 @@ impl Shared {
 
     fn end_all(&self, reason: &str) {
         for job in self.kept_jobs() {
-            self.end(job.id, End::Failed(reason.to_owned()));
+            self.end(job.id, Outcome::Failed(reason.to_owned()));
         }
     }
 

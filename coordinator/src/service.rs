@@ -9,11 +9,12 @@ use std::{
 };
 
 use rtfarm_core::{
-    picture::{PutError, check_pixels},
     read::{Style, draw_diagnostics},
     render::Tally,
     tile::{Size, TileId},
 };
+use rtfarm_job::{FinishedTile, Outcome, Placed, Progress, Refusal, RenderRequest};
+use rtfarm_picture::{PutError, check_pixels};
 use rtfarm_proto::{
     CHUNK_BYTES, JobId, LONGEST_WAIT, LeaseName, MESSAGE_BYTES, PROTOCOL, WireError, WorkerId,
     pixels_from_bytes, scene_hash, transfer,
@@ -32,10 +33,9 @@ use tonic::{
 };
 
 use crate::{
-    job::{End, Job, Progress},
+    job::Job,
     jobs::{Next, NoMember},
     lease::{PixelHash, Verdict},
-    order::{Placed, Refusal, Wish},
     run::{Coordinator, Shared},
 };
 
@@ -209,7 +209,7 @@ impl Shared {
         }
         if let Err(error) = check_pixels(area, &pixels) {
             let reason = format!("worker {worker} rendered tile {}: {error}", tile.number());
-            self.end(job.id, End::Failed(reason));
+            self.end(job.id, Outcome::Failed(reason));
             return Ok(wire::Verdict::Rejected);
         }
 
@@ -242,7 +242,7 @@ impl Shared {
     }
 
     fn fail_picture(&self, job: &Job, error: &PutError) {
-        self.end(job.id, End::Failed(error.to_string()));
+        self.end(job.id, Outcome::Failed(error.to_string()));
     }
 
     fn on_stitched(
@@ -253,24 +253,18 @@ impl Shared {
         (tally, seconds): (Tally, f64),
     ) {
         let elapsed = job.started.elapsed();
+        let is_first_of_worker = job.note_worker(worker);
         let mut now_done = Progress::default();
         job.progress.send_modify(|progress| {
             progress.tiles_done += 1;
             progress.tally.add(&tally);
-            progress.workers.insert(worker);
+            progress.worker_count += u32::from(is_first_of_worker);
             now_done.clone_from(progress);
         });
-        let (done, count) = (now_done.tiles_done, now_done.tile_count);
-        crate::log_tile(
-            done,
-            count,
-            tile,
-            worker,
-            &crate::TileCost { seconds, rays: tally.rays },
-            elapsed,
-        );
-        if done == count {
-            self.end(job.id, End::Finished(elapsed));
+        let (worker, rays) = (Some(worker.0), tally.rays);
+        FinishedTile { tile, worker, seconds, rays }.log(&now_done, elapsed);
+        if now_done.tiles_done == now_done.tile_count {
+            self.end(job.id, Outcome::Finished(elapsed));
         }
     }
 }
@@ -287,7 +281,7 @@ impl jobs_server::Jobs for JobsService {
     ) -> Result<Response<wire::SubmitResponse>, Status> {
         let Bundle { order, text, files } = receive(request.into_inner()).await?;
         check_version("client", &order.version, order.protocol, &self.shared)?;
-        let wish = to_wish(order).map_err(invalid)?;
+        let wanted = to_request(order).map_err(invalid)?;
         let coordinator = Coordinator { shared: Arc::clone(&self.shared) };
         let (outcome, report) = blocking(move || {
             let resolve = |path: &str| {
@@ -296,8 +290,8 @@ impl jobs_server::Jobs for JobsService {
                     io::Error::new(io::ErrorKind::NotFound, reason)
                 })
             };
-            let name = wish.name.clone();
-            let Placed { order, diagnostics, omitted } = wish.place(&text, &resolve);
+            let name = wanted.name.clone();
+            let Placed { order, diagnostics, omitted } = wanted.place(&text, &resolve);
             let mut report = draw_diagnostics(&name, &text, &diagnostics, Style::Plain);
             report.extend(omitted.summary());
             let job = order.and_then(|order| {
@@ -351,7 +345,7 @@ impl jobs_server::Jobs for JobsService {
         request: Request<wire::ImageRequest>,
     ) -> Result<Response<Chunks>, Status> {
         let job = self.known_job(request.into_inner().job)?;
-        if !matches!(job.progress.borrow().end, Some(End::Finished(_))) {
+        if !matches!(job.progress.borrow().outcome, Some(Outcome::Finished(_))) {
             return Err(Status::failed_precondition("the job has not finished"));
         }
         let folder = self.shared.config.picture_folder.clone();
@@ -420,14 +414,14 @@ async fn receive(mut parts: Streaming<wire::SubmitRequest>) -> Result<Bundle, St
     Ok(Bundle { order, text, files })
 }
 
-fn to_wish(order: wire::Order) -> Result<Wish, WireError> {
+fn to_request(order: wire::Order) -> Result<RenderRequest, WireError> {
     let format = order.format().try_into()?;
     let size = order.frame.map(Size::try_from).transpose()?;
     let transfer = transfer(order.transfer)?;
     let quality = order.quality.ok_or(WireError::Missing("quality"))?.try_into()?;
     let wire::Order { name, strict, tile_side, .. } = order;
     let tile_side = (tile_side > 0).then_some(tile_side.into());
-    Ok(Wish { name, strict, size, quality, tile_side, transfer, format })
+    Ok(RenderRequest { name, strict, size, quality, tile_side, transfer, format })
 }
 
 fn to_event(progress: &Progress) -> wire::Event {
@@ -435,13 +429,13 @@ fn to_event(progress: &Progress) -> wire::Event {
         tiles_done: progress.tiles_done,
         tile_count: progress.tile_count,
         tally: Some(progress.tally.into()),
-        workers: progress.workers.len() as u32,
+        workers: progress.worker_count,
         differing_tiles: progress.differing_tiles,
-        end: progress.end.as_ref().map(|end| match end {
-            End::Finished(time) => {
+        end: progress.outcome.as_ref().map(|outcome| match outcome {
+            Outcome::Finished(time) => {
                 event::End::Finished(wire::Finished { seconds: time.as_secs_f64() })
             }
-            End::Failed(reason) => event::End::Failed(reason.clone()),
+            Outcome::Failed(reason) => event::End::Failed(reason.clone()),
         }),
     }
 }

@@ -9,7 +9,7 @@ use rtfarm_core::{
     prepare::prepare,
     prepared::{PreparedBytes, PreparedScene},
     scene::{Material, Scene, Triangle, Viewport},
-    trace::{FaceTests, Probe},
+    testing::{FaceTests, Probe, Probing},
 };
 use rtfarm_oracle::{Oracle, random::Random};
 use tokio::time::Instant;

@@ -7,7 +7,7 @@ use rtfarm_core::{
     isa::Isa,
     prepare::prepare,
     prepared::{PreparedBytes, PreparedScene},
-    render::{Quality, Sampling, Settings, render_tile},
+    render::{Quality, Sampling, render_tile},
     tile::{Area, Size},
 };
 use rtfarm_oracle::known_pictures::KnownPicture;
@@ -89,7 +89,7 @@ impl Ladder {
     /// Renders every rung with every seed; the kinds take turns seed by seed, so that a busy
     /// moment of the machine meets both. `None` when `stop` came first.
     pub(super) fn climb(subject: Subject, reach: Reach, stop: &CancellationToken) -> Option<Self> {
-        let fixed = (0..reach.rungs).map(|rung| Sampling::Fixed(8 << rung));
+        let fixed = (0..reach.rungs).map(|rung| Sampling::fixed(8 << rung).expect("few enough"));
         // Over one range however many there are: 16 to 0.5 steps of 8 bits.
         let finest = 10;
         let last = reach.rungs.max(2) - 1;
@@ -164,13 +164,13 @@ fn measure(
 fn run(subject: &Subject, sampling: Sampling, seed: u64, stop: &CancellationToken) -> Option<Run> {
     let Subject { scene, truth, .. } = subject;
     let size = truth.size;
-    let settings = Settings { size, quality: Quality { sampling, seed, ..Quality::default() } };
-    let area = Area { x0: 0, y0: 0, width: size.width(), height: size.height() };
+    let quality = Quality { sampling, seed, ..Quality::default() };
+    let area = Area::whole(size);
     let started = Instant::now();
-    let rendered = render_tile(scene, &settings, area, Isa::fastest(), &mut || go_on(stop))?;
+    let rendered = render_tile(scene, &quality, area, Isa::fastest(), &mut || go_on(stop))?;
     let milliseconds = started.elapsed().as_secs_f64() * 1e3;
     let asked = match sampling {
-        Sampling::Adaptive { error, .. } => Some(error),
+        Sampling::Adaptive { error, .. } => Some(error.get()),
         Sampling::Fixed(_) => None,
     };
     let errors = Errors::new(&rendered.pixels, truth, asked);

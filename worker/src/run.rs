@@ -364,7 +364,7 @@ impl Member {
                 let area = job.grid.area(tile);
                 let pixels = match on_progress() {
                     ControlFlow::Continue(()) => {
-                        render_tile(&scene, &job.settings, area, isa, &mut on_progress)
+                        render_tile(&scene, &job.settings.quality, area, isa, &mut on_progress)
                     }
                     ControlFlow::Break(()) => None,
                 };

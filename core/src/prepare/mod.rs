@@ -61,7 +61,6 @@ pub fn prepare(scene: &Scene) -> Result<PreparedBytes, PrepareError> {
 
 /// The same, but light that faces send on is looked for all over the sky alone: the noisier way
 /// that benchmarks compare with.
-#[doc(hidden)]
 pub fn prepare_unaimed(scene: &Scene) -> Result<PreparedBytes, PrepareError> {
     prepare_gathering(scene, Features::UNAIMED)
 }

@@ -8,7 +8,7 @@ use std::ops::ControlFlow;
 
 use glam::DVec3;
 
-use super::settings::{Quality, Settings};
+use super::settings::Quality;
 use crate::{
     isa::Isa,
     left_out,
@@ -20,6 +20,7 @@ use crate::{
         point::{Point, surface_color},
         ray_differential::RayDifferential,
     },
+    tile::Size,
     trace::{
         batch::{trace, trace_shadows},
         ray::{Hit, Ray},
@@ -85,11 +86,12 @@ impl Batch {
     pub(crate) fn start(
         &mut self,
         view: &View<'_>,
-        settings: &Settings,
+        quality: &Quality,
+        frame: Size,
         samples: impl Iterator<Item = CameraSample>,
     ) {
-        let (size, camera) = (settings.size, &view.header.camera);
-        let gathers = gathers(view, &settings.quality);
+        let camera = &view.header.camera;
+        let gathers = gathers(view, quality);
         let has_textures = view.header.features.has_textures();
         let screen = [camera.top_left, camera.right, camera.down].map(DVec3::from_array);
         self.rays.clear();
@@ -100,11 +102,11 @@ impl Batch {
                 self.samples.push(sample);
             }
             let [across, down] = sample.position();
-            let u = (f64::from(x) + across) / f64::from(size.width());
-            let v = (f64::from(y) + down) / f64::from(size.height());
+            let u = (f64::from(x) + across) / f64::from(frame.width());
+            let v = (f64::from(y) + down) / f64::from(frame.height());
             let direction = screen[0] + u * screen[1] + v * screen[2];
             if has_textures {
-                let steps = [(1, size.width()), (2, size.height())]
+                let steps = [(1, frame.width()), (2, frame.height())]
                     .map(|(side, count)| screen[side] * (spread / f64::from(count)));
                 self.spreads.push(RayDifferential::of_camera(direction, steps));
             }
@@ -157,9 +159,9 @@ impl Batch {
                 let branch = self.branches[index];
                 if self.hits[index].is_some() {
                     if has_textures {
-                        self.meet::<true>(view, index, quality.cutoff, depth);
+                        self.meet::<true>(view, index, quality.cutoff.get(), depth);
                     } else {
-                        self.meet::<false>(view, index, quality.cutoff, depth);
+                        self.meet::<false>(view, index, quality.cutoff.get(), depth);
                     }
                 } else {
                     self.colors[branch.sample] += branch.weight * background;

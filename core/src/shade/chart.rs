@@ -134,10 +134,12 @@ impl Texcoords {
 
 #[cfg(test)]
 mod tests {
-    use rtfarm_oracle::random::Random;
+    use rtfarm_oracle::{
+        hard_case::{HardCase, random, rays},
+        random::Random,
+    };
 
     use super::*;
-    use crate::long::{random, rays, tell};
 
     /// The point at a place, and how much of a rounding error there the place takes on.
     fn point(corners: &[DVec3; 4], place: DVec2) -> (DVec3, f64) {
@@ -213,13 +215,11 @@ mod tests {
             check_round_trips("a needle", needle, random);
         }
         let count = 6 * 100 * shapes;
-        tell(
-            39,
+        HardCase::TextureRoundTrip.tell(
             "texture coordinates survive the way to a quadrangle and back",
             format!("{count} places, off by {worst:.1e} at most"),
         );
-        tell(
-            40,
+        HardCase::TextureBorder.tell(
             "texture coordinates stay in the image, also on its border",
             format!("0 of {count} places outside, 36 % of them on the border"),
         );

@@ -1,4 +1,4 @@
-//! A node of the 8-wide hierarchy and the kernels that test a ray against its boxes.
+//! The test of a ray against the eight boxes of a node.
 //!
 //! Boxes are f32, relative to the scene's f64 frame and rounded outward; a test only ever decides
 //! what may be skipped. Source of the rounding: Ize, "Robust BVH Ray Traversal" (2013). Every
@@ -6,24 +6,26 @@
 
 use glam::DVec3;
 
+use super::boxes_x86::{Avx2Boxes, Sse2Boxes};
 use crate::{
     exact::float::{above, below},
+    isa::Isa,
     prepared::node::{Frame, Node},
 };
 
 /// A ray ready to meet boxes, in the boxes' frame.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct BoxRay {
+pub(super) struct BoxRay {
     /// Which of a node's planes is met first on each axis, and which last.
-    near: [usize; 3],
-    far: [usize; 3],
+    pub(super) near: [usize; 3],
+    pub(super) far: [usize; 3],
     /// The ray's start, rounded so that near planes come nearer and far planes go farther.
-    near_origin: [f32; 3],
-    far_origin: [f32; 3],
-    inverse: [f32; 3],
+    pub(super) near_origin: [f32; 3],
+    pub(super) far_origin: [f32; 3],
+    pub(super) inverse: [f32; 3],
     /// The stretch of the ray that counts; `high` is NaN for a ray that meets nothing.
-    low: f32,
-    high: f32,
+    pub(super) low: f32,
+    pub(super) high: f32,
     /// Turns a distance along the ray into the boxes' frame: (t - start) · scale.
     start: f64,
     scale: f64,
@@ -33,14 +35,14 @@ pub(crate) struct BoxRay {
 
 /// Far planes are moved out by 4 ulp: 2 for the rounding of f32 (Ize 2013), the rest covers that
 /// of the f64 tests, which is 2^29 times finer.
-const FAR: f32 = 1.0 + 4.0 * f32::EPSILON;
+pub(super) const FAR: f32 = 1.0 + 4.0 * f32::EPSILON;
 
 /// Three f32 roundings may move a near plane by 1.5 ulp away: so much more is within reach.
 const NEAR: f64 = 2.0 * f32::EPSILON as f64;
 
 impl BoxRay {
     #[inline(always)]
-    pub(crate) fn new(origin: DVec3, direction: DVec3, reach: f64, frame: &Frame) -> Self {
+    pub(super) fn new(origin: DVec3, direction: DVec3, reach: f64, frame: &Frame) -> Self {
         let mut relative = (origin - DVec3::from_array(frame.origin)) * frame.scale;
         // Seen from afar the scene is a speck in f32: start where it begins. All of it lies
         // within sqrt(3) of the frame's origin.
@@ -95,30 +97,33 @@ impl BoxRay {
     /// Boxes that begin beyond `t` no longer count, nor may those that begin just there be lost:
     /// what is in them may come first in the file.
     #[inline(always)]
-    pub(crate) fn shorten(&mut self, t: f64) {
+    pub(super) fn shorten(&mut self, t: f64) {
         let reach = (t - self.start) * self.scale + self.slack;
         self.high = above(reach + reach.abs() * NEAR);
     }
 
     /// Whether a box that begins at `near` still counts.
     #[inline(always)]
-    pub(crate) fn reaches(&self, near: f32) -> bool {
+    pub(super) fn reaches(&self, near: f32) -> bool {
         near <= self.high
     }
 }
 
 /// Tests a ray against a node's eight boxes: the distances at which it enters them, and which of
 /// them it meets, a bit each. Distances of boxes that are not met mean nothing.
-pub(crate) trait BoxKernel {
-    fn test(node: &Node, ray: &BoxRay) -> ([f32; 8], u32);
+///
+/// A kernel is a value, and only a CPU that runs it has one.
+pub(super) trait BoxKernel: Copy {
+    fn test(self, node: &Node, ray: &BoxRay) -> ([f32; 8], u32);
 }
 
-/// Plain Rust.
-pub(crate) struct ScalarBoxes;
+/// The kernel in plain Rust, for every CPU.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct ScalarBoxes;
 
 impl BoxKernel for ScalarBoxes {
     #[inline(always)]
-    fn test(node: &Node, ray: &BoxRay) -> ([f32; 8], u32) {
+    fn test(self, node: &Node, ray: &BoxRay) -> ([f32; 8], u32) {
         // As the SIMD instructions have it: of a NaN (an origin on the plane of a box that the
         // ray runs along) and a number, the second operand is taken.
         let larger = |a: f32, b: f32| if a > b { a } else { b };
@@ -139,79 +144,110 @@ impl BoxKernel for ScalarBoxes {
     }
 }
 
-#[cfg(target_arch = "x86_64")]
-#[expect(unsafe_code, reason = "SIMD intrinsics")]
-pub(crate) mod x86 {
-    //! The same with SSE2 and AVX2.
+/// Work that is compiled once for each instruction set.
+pub(super) trait KernelWork {
+    fn run(&mut self, kernel: impl BoxKernel);
+}
 
-    use std::arch::x86_64::{
-        _CMP_LE_OQ, _mm_cmple_ps, _mm_loadu_ps, _mm_max_ps, _mm_min_ps, _mm_movemask_ps,
-        _mm_mul_ps, _mm_set1_ps, _mm_storeu_ps, _mm_sub_ps, _mm256_cmp_ps, _mm256_loadu_ps,
-        _mm256_max_ps, _mm256_min_ps, _mm256_movemask_ps, _mm256_mul_ps, _mm256_set1_ps,
-        _mm256_storeu_ps, _mm256_sub_ps,
-    };
+/// Does work with the kernel of an instruction set, which this CPU must have.
+pub(super) fn run_with_kernel(isa: Isa, work: &mut impl KernelWork) {
+    const LACKING: &str = "instruction sets are chosen among those that the CPU has";
+    match isa {
+        Isa::Scalar => work.run(ScalarBoxes),
+        #[cfg(target_arch = "x86_64")]
+        Isa::Sse2 => work.run(Sse2Boxes::new()),
+        #[cfg(target_arch = "x86_64")]
+        Isa::Avx2 => Avx2Boxes::detect().expect(LACKING).run(work),
+        #[cfg(not(target_arch = "x86_64"))]
+        Isa::Sse2 | Isa::Avx2 => panic!("{LACKING}"),
+    }
+}
 
-    use super::{BoxKernel, BoxRay, FAR, Node};
+#[cfg(test)]
+mod tests {
+    use rtfarm_oracle::random::Random;
 
-    /// Four boxes at a time.
-    pub(crate) struct Sse2Boxes;
+    use super::*;
+    use crate::prepared::node::{Child, Frame};
 
-    impl BoxKernel for Sse2Boxes {
-        #[inline(always)]
-        fn test(node: &Node, ray: &BoxRay) -> ([f32; 8], u32) {
-            let mut distances = [0.0; 8];
-            let mut mask = 0;
-            for half in [0, 4] {
-                // SAFETY: SSE2 is part of x86-64. The loads read `planes[_][half..half + 4]` and
-                // the store writes `distances[half..half + 4]`, both within 8 floats.
-                unsafe {
-                    let mut enter = _mm_set1_ps(ray.low);
-                    let mut leave = _mm_set1_ps(ray.high);
-                    for axis in 0..3 {
-                        let near = _mm_loadu_ps(node.planes[ray.near[axis]].as_ptr().add(half));
-                        let far = _mm_loadu_ps(node.planes[ray.far[axis]].as_ptr().add(half));
-                        let inverse = _mm_set1_ps(ray.inverse[axis]);
-                        let near = _mm_sub_ps(near, _mm_set1_ps(ray.near_origin[axis]));
-                        let far = _mm_sub_ps(far, _mm_set1_ps(ray.far_origin[axis]));
-                        enter = _mm_max_ps(_mm_mul_ps(near, inverse), enter);
-                        let far = _mm_mul_ps(_mm_mul_ps(far, inverse), _mm_set1_ps(FAR));
-                        leave = _mm_min_ps(far, leave);
-                    }
-                    _mm_storeu_ps(distances.as_mut_ptr().add(half), enter);
-                    let met = _mm_movemask_ps(_mm_cmple_ps(enter, leave));
-                    mask |= (met as u32) << half;
-                }
+    /// Nodes with boxes of all kinds: thick, flat, touching, far away, unused.
+    fn random_node(random: &mut Random) -> Node {
+        let mut node = Node::EMPTY;
+        for child in 0..8 {
+            if random.below(6) == 0 {
+                continue; // It stays unused.
             }
-            (distances, mask)
+            for axis in 0..3 {
+                let low = grid_or_any(random);
+                let thickness = [0.0, f64::from(f32::EPSILON), 0.25, 1.0][random.below(4)];
+                node.planes[axis][child] = low as f32;
+                node.planes[axis + 3][child] = (low + thickness) as f32;
+            }
+            node.children[child] = Child::leaf(child, 1);
+        }
+        node
+    }
+
+    /// A number among few, so that rays start on planes and graze edges, or any number.
+    fn grid_or_any(random: &mut Random) -> f64 {
+        match random.below(3) {
+            0 => random.between(-1.0, 1.0),
+            _ => random.below(9) as f64 / 4.0 - 1.0,
         }
     }
 
-    /// All eight at once. Only for code that [`crate::isa::Isa::is_supported`] lets through.
-    pub(crate) struct Avx2Boxes;
+    /// Rays from everywhere, along axes and planes too, of any reach.
+    fn random_ray(random: &mut Random) -> BoxRay {
+        let origin = DVec3::from_array([(); 3].map(|()| match random.below(8) {
+            0 => 1e9 * grid_or_any(random),
+            _ => grid_or_any(random),
+        }));
+        let direction = DVec3::from_array([(); 3].map(|()| match random.below(4) {
+            0 => 0.0,
+            1 => -0.0,
+            _ => random.between(-1.0, 1.0),
+        }));
+        let length = direction.length();
+        let direction = if length > 0.0 { direction / length } else { direction };
+        let reach = [f64::INFINITY, 0.5, 3.0, f64::MIN_POSITIVE][random.below(4)];
+        BoxRay::new(origin, direction, reach, &Frame { origin: [0.0; 3], scale: 1.0 })
+    }
 
-    impl BoxKernel for Avx2Boxes {
-        #[inline(always)]
-        fn test(node: &Node, ray: &BoxRay) -> ([f32; 8], u32) {
-            let mut distances = [0.0; 8];
-            // SAFETY: the loads and the store cover exactly 8 floats. Callers run this only on
-            // CPUs with AVX2: `trace` hands it out through `trace_avx2`, whose caller has asked.
-            let mask = unsafe {
-                let mut enter = _mm256_set1_ps(ray.low);
-                let mut leave = _mm256_set1_ps(ray.high);
-                for axis in 0..3 {
-                    let near = _mm256_loadu_ps(node.planes[ray.near[axis]].as_ptr());
-                    let far = _mm256_loadu_ps(node.planes[ray.far[axis]].as_ptr());
-                    let inverse = _mm256_set1_ps(ray.inverse[axis]);
-                    let near = _mm256_sub_ps(near, _mm256_set1_ps(ray.near_origin[axis]));
-                    let far = _mm256_sub_ps(far, _mm256_set1_ps(ray.far_origin[axis]));
-                    enter = _mm256_max_ps(_mm256_mul_ps(near, inverse), enter);
-                    let far = _mm256_mul_ps(_mm256_mul_ps(far, inverse), _mm256_set1_ps(FAR));
-                    leave = _mm256_min_ps(far, leave);
-                }
-                _mm256_storeu_ps(distances.as_mut_ptr(), enter);
-                _mm256_movemask_ps(_mm256_cmp_ps::<_CMP_LE_OQ>(enter, leave)) as u32
-            };
-            (distances, mask)
+    /// What a kernel finds in a node: the mask, and the bits of the distances of what is met.
+    struct Test<'a> {
+        node: &'a Node,
+        ray: &'a BoxRay,
+        found: Option<(u32, [u32; 8])>,
+    }
+
+    impl KernelWork for Test<'_> {
+        fn run(&mut self, kernel: impl BoxKernel) {
+            let (distances, mask) = kernel.test(self.node, self.ray);
+            let mut bits = distances.map(f32::to_bits);
+            for (child, bits) in bits.iter_mut().enumerate() {
+                *bits *= mask >> child & 1;
+            }
+            self.found = Some((mask, bits));
         }
+    }
+
+    #[test]
+    fn every_kernel_meets_the_same_boxes_at_the_same_distances() {
+        let random = &mut Random::new(17);
+        let mut met = 0;
+        for _ in 0..20_000 {
+            let (node, ray) = (random_node(random), random_ray(random));
+            let find = |isa| {
+                let mut test = Test { node: &node, ray: &ray, found: None };
+                run_with_kernel(isa, &mut test);
+                test.found.expect("the kernel ran")
+            };
+            let scalar = find(Isa::Scalar);
+            met += scalar.0.count_ones();
+            for isa in Isa::ALL.into_iter().filter(|isa| isa.is_supported()) {
+                assert_eq!(find(isa), scalar, "{isa}: {node:?} {ray:?}");
+            }
+        }
+        assert!(met > 10_000, "{met} of 160,000 boxes are met");
     }
 }

@@ -1,7 +1,10 @@
 //! Rays through a prepared scene: what they meet.
 
 pub(crate) mod batch;
-pub(crate) mod boxes;
+mod boxes;
+#[cfg(target_arch = "x86_64")]
+#[expect(unsafe_code, reason = "SIMD intrinsics")]
+mod boxes_x86;
 pub(crate) mod hit;
 pub(crate) mod probe;
 pub(crate) mod quadrangle;
@@ -10,5 +13,3 @@ pub(crate) mod solid;
 pub(crate) mod sphere;
 pub(crate) mod traversal;
 pub(crate) mod triangle;
-
-pub use probe::{FaceTests, Probe, ProbeHit};

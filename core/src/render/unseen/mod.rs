@@ -83,11 +83,12 @@ impl<'a> UnseenSearch<'a> {
         on_found: &mut impl FnMut(u32, u32, UnseenFaces),
     ) {
         let Some((&(side, most), smaller)) = sizes.split_first() else {
-            let (x, y) = (area.x0, area.y0);
+            let (x, y) = (area.x0(), area.y0());
             return self.search_crowded(x, y, &first_samples(x, y), on_found);
         };
-        for block in blocks(area, side) {
-            let deepest = pixels_of(block)
+        for block in area.blocks(side) {
+            let deepest = block
+                .pixels()
                 .map(|(x, y)| self.deepest(x, y, first_samples(x, y).hits))
                 .fold(0.0, f64::max);
             let beam = Beam { block: Rectangle::of_block(block), deepest };
@@ -95,7 +96,7 @@ impl<'a> UnseenSearch<'a> {
                 self.search_blocks(block, smaller, first_samples, on_found);
                 continue;
             }
-            for (x, y) in pixels_of(block) {
+            for (x, y) in block.pixels() {
                 let first = first_samples(x, y);
                 let unseen = self.find_unseen(x, y, &first, self.deepest(x, y, first.hits));
                 if !unseen.is_empty() {
@@ -156,24 +157,6 @@ impl<'a> UnseenSearch<'a> {
     ) {
         self.judge.note_samples(&self.screen, unseen, places, count);
     }
-}
-
-/// Cuts an area into blocks of at most this side, in pixels, row by row.
-pub(super) fn blocks(area: Area, side: u32) -> impl Iterator<Item = Area> {
-    let Area { x0, y0, width, height } = area;
-    (0..height).step_by(side as usize).flat_map(move |y| {
-        (0..width).step_by(side as usize).map(move |x| Area {
-            x0: x0 + x,
-            y0: y0 + y,
-            width: side.min(width - x),
-            height: side.min(height - y),
-        })
-    })
-}
-
-/// Lists the pixels of an area, row by row.
-fn pixels_of(Area { x0, y0, width, height }: Area) -> impl Iterator<Item = (u32, u32)> {
-    (y0..y0 + height).flat_map(move |y| (x0..x0 + width).map(move |x| (x, y)))
 }
 
 #[cfg(test)]
@@ -241,7 +224,8 @@ mod tests {
     fn beams_meet_the_faces_that_they_meet_without_the_hierarchy() {
         let scene = clutter();
         let view = scene.view();
-        let screen = Screen::new(&view.header.camera, Size::new(40, 30).unwrap()).unwrap();
+        let size = Size::new(40, 30).unwrap();
+        let screen = Screen::new(&view.header.camera, size).unwrap();
         let ranks = |outlines: &Outlines| {
             let mut ranks: Vec<u32> = outlines.as_slice().iter().map(|face| face.rank).collect();
             ranks.sort_unstable();
@@ -249,10 +233,7 @@ mod tests {
         };
         let mut search = FrustumSearch::default();
         let mut total = 0;
-        for block in [1, 2, 8]
-            .into_iter()
-            .flat_map(|side| blocks(Area { x0: 0, y0: 0, width: 40, height: 30 }, side))
-        {
+        for block in [1, 2, 8].into_iter().flat_map(|side| Area::whole(size).blocks(side)) {
             for deepest in [0.7, 2.0, f64::INFINITY] {
                 let beam = Beam { block: Rectangle::of_block(block), deepest };
                 assert!(search.collect(&view, &screen, &beam, usize::MAX));
@@ -270,8 +251,9 @@ mod tests {
     fn fragments_of_a_face_in_all_pixels_are_the_face() {
         let scene = clutter();
         let view = scene.view();
-        let screen = Screen::new(&view.header.camera, Size::new(40, 30).unwrap()).unwrap();
-        let frame = Area { x0: 0, y0: 0, width: 40, height: 30 };
+        let size = Size::new(40, 30).unwrap();
+        let screen = Screen::new(&view.header.camera, size).unwrap();
+        let frame = Area::whole(size);
         let beam = Beam { block: Rectangle::of_block(frame), deepest: f64::INFINITY };
         let mut search = FrustumSearch::default();
         assert!(search.collect(&view, &screen, &beam, usize::MAX));
@@ -288,7 +270,7 @@ mod tests {
                 let b = &corners[(k + 1) % corners.len()];
                 area += (a[0] * b[1] - a[1] * b[0]) / 2.0;
             }
-            let shares = pixels_of(frame).filter_map(|(x, y)| {
+            let shares = frame.pixels().filter_map(|(x, y)| {
                 let pixel = Rectangle::of_pixel(x, y);
                 let overlaps = face.bounds.overlaps(&pixel);
                 let cut = || Fragment::new(corners, &face.bounds, &pixel, &mut clipper);

@@ -86,8 +86,12 @@ impl Rectangle {
     pub(super) const EMPTY: Self = Self { low: [f64::INFINITY; 2], high: [f64::NEG_INFINITY; 2] };
 
     /// The rectangle of a block of pixels.
-    pub(super) fn of_block(Area { x0, y0, width, height }: Area) -> Self {
-        Self { low: [x0.into(), y0.into()], high: [(x0 + width).into(), (y0 + height).into()] }
+    pub(super) fn of_block(block: Area) -> Self {
+        let (columns, rows) = (block.columns(), block.rows());
+        Self {
+            low: [columns.start.into(), rows.start.into()],
+            high: [columns.end.into(), rows.end.into()],
+        }
     }
 
     /// The square of a pixel.
