@@ -141,9 +141,10 @@ impl Gatherer {
         if material.emits() {
             let Path { receiver, sample, .. } = &path;
             let density = match sample.emitter {
-                None if sample.hemisphere >= 1.0 => 1.0,
+                None if sample.hemisphere_probability >= 1.0 => 1.0,
                 None => {
-                    let (index, hemisphere) = (view.emitter_of(hit.rank), sample.hemisphere);
+                    let (index, hemisphere) =
+                        (view.emitter_of(hit.rank), sample.hemisphere_probability);
                     sampling::density(view, receiver, hemisphere, index, ray.direction, distance)
                 }
                 Some((wanted, density)) if view.emitters[wanted as usize].rank == hit.rank => {

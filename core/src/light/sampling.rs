@@ -24,7 +24,7 @@ pub(super) struct LightSample {
     pub(super) direction: DVec3,
     /// The probability with which the whole hemisphere is sampled instead of one emitter: above 0,
     /// at most 1.
-    pub(super) hemisphere: f64,
+    pub(super) hemisphere_probability: f64,
     /// The emitter that the direction was chosen for, and the direction's probability density for
     /// what that emitter gives, relative to the density cosine / π of the hemisphere. It is `None`
     /// where the whole hemisphere was sampled: then all emitters count.
@@ -84,7 +84,11 @@ pub(super) fn sample_light(
         + (1.0 - hemisphere)
             * probability
             * relative_density(emitter, receiver, direction, distance);
-    Some(LightSample { direction, hemisphere, emitter: Some((index, density)) })
+    Some(LightSample {
+        direction,
+        hemisphere_probability: hemisphere,
+        emitter: Some((index, density)),
+    })
 }
 
 /// The probability density, relative to the density cosine / π of the hemisphere, with which
@@ -136,7 +140,7 @@ fn relative_density(
 /// rounding leads below the horizon.
 fn sample_hemisphere(
     receiver: &Receiver,
-    hemisphere: f64,
+    hemisphere_probability: f64,
     numbers: [f64; 2],
 ) -> Option<LightSample> {
     let [x, y] = to_disc(numbers);
@@ -145,7 +149,7 @@ fn sample_hemisphere(
     let direction = x * right + y * up + z * receiver.normal;
     let direction = direction / direction.length();
     let is_above = receiver.normal.dot(direction) > 0.0;
-    is_above.then_some(LightSample { direction, hemisphere, emitter: None })
+    is_above.then_some(LightSample { direction, hemisphere_probability, emitter: None })
 }
 
 /// The cone in which a receiver sees a sphere.

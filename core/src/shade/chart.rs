@@ -14,7 +14,7 @@ use crate::{
 /// The face is seen along the axis that its normal is closest to, from the side that sees its
 /// corners counter-clockwise, in units near its own size.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Chart {
+pub(super) struct Chart {
     corner: DVec3,
     axes: [usize; 2],
     scale: f64,
@@ -27,7 +27,7 @@ pub(crate) struct Chart {
 impl Chart {
     /// Makes the chart of a face with three corners or four, counter-clockwise seen from where
     /// `normal` points.
-    pub(crate) fn new(corners: &[DVec3], normal: DVec3) -> Self {
+    pub(super) fn new(corners: &[DVec3], normal: DVec3) -> Self {
         let from_first = |k: usize| corners[k] - corners[0];
         let extent =
             (1..corners.len()).map(|k| from_first(k).abs().max_element()).fold(0.0, f64::max);
@@ -61,7 +61,7 @@ impl Chart {
     /// the map goes round the outline once and has no more than two roots. So that root is taken,
     /// in the form that cancels nothing: there is no division by the twist, which is 0 in a
     /// parallelogram.
-    pub(crate) fn place(&self, point: DVec3) -> DVec2 {
+    pub(super) fn place(&self, point: DVec3) -> DVec2 {
         let from_corner = self.project(point - self.corner);
         let area = cross(self.along, self.up);
         let turned = cross(from_corner, self.twist);
@@ -77,7 +77,7 @@ impl Chart {
 
     /// Tells how a step along the face, in the block's units, moves the place. It is not finite where
     /// the map folds.
-    pub(crate) fn step(&self, place: DVec2, step: DVec3) -> DVec2 {
+    pub(super) fn step(&self, place: DVec2, step: DVec3) -> DVec2 {
         let step = self.project(step);
         let along = self.along + place.y * self.twist;
         let up = self.up + place.x * self.twist;
@@ -118,14 +118,14 @@ impl Texcoords {
     }
 
     /// The texture coordinates at a place.
-    pub(crate) fn at(&self, place: DVec2) -> DVec2 {
+    pub(super) fn at(&self, place: DVec2) -> DVec2 {
         let [a, b, c, d] = self.0.map(DVec2::from_array);
         let (s, t) = (place.x, place.y);
         (a * (1.0 - s) + b * s) * (1.0 - t) + (d * (1.0 - s) + c * s) * t
     }
 
     /// Tells how a step from a place moves the texture coordinates there.
-    pub(crate) fn step(&self, place: DVec2, step: DVec2) -> DVec2 {
+    pub(super) fn step(&self, place: DVec2, step: DVec2) -> DVec2 {
         let [a, b, c, d] = self.0.map(DVec2::from_array);
         let (s, t) = (place.x, place.y);
         ((b - a) * (1.0 - t) + (c - d) * t) * step.x + ((d - a) * (1.0 - s) + (c - b) * s) * step.y
