@@ -5,10 +5,13 @@ use std::f64::consts::FRAC_1_SQRT_2;
 use glam::DVec3;
 
 use super::screen::{Beam, Rectangle, Screen};
-use crate::prepared::{
-    face::{Face, Part},
-    layout::View,
-    record::{Item, Kind, LeafRecord},
+use crate::{
+    exact::clip::clip,
+    prepared::{
+        face::{Face, Part},
+        layout::View,
+        record::{Item, Kind, LeafRecord},
+    },
 };
 
 /// Spheres with a larger radius on the screen, in pixels, have no outline: the samples of their
@@ -267,24 +270,10 @@ impl Clipper {
     }
 
     /// Cuts off the part of the polygon where `height`, which is linear, is below 0.
-    ///
-    /// Source: Sutherland & Hodgman, "Reentrant Polygon Clipping" (1974).
-    fn clip(&mut self, height: impl Fn(&Corner) -> f64) {
-        self.spare.clear();
-        let Some(mut last) = self.polygon.last().copied() else { return };
-        let mut last_height = height(&last);
-        for &corner in &self.polygon {
-            let its_height = height(&corner);
-            if (its_height < 0.0) != (last_height < 0.0) {
-                let part = last_height / (last_height - its_height);
-                self.spare.push([0, 1, 2].map(|k| last[k] + part * (corner[k] - last[k])));
-            }
-            if its_height >= 0.0 {
-                self.spare.push(corner);
-            }
-            (last, last_height) = (corner, its_height);
-        }
-        std::mem::swap(&mut self.polygon, &mut self.spare);
+    fn clip(&mut self, height: impl Fn(Corner) -> f64) {
+        let between =
+            |p: Corner, q: Corner, share: f64| [0, 1, 2].map(|k| p[k] + share * (q[k] - p[k]));
+        clip(&mut self.polygon, &mut self.spare, height, between);
     }
 
     /// What is left of the polygon.
