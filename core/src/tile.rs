@@ -83,11 +83,6 @@ impl Area {
         Self { frame, x0: 0, y0: 0, width: frame.width, height: frame.height }
     }
 
-    /// One pixel, which the frame must have.
-    pub(crate) fn pixel(frame: Size, x: u32, y: u32) -> Self {
-        Self::new(frame, [x, y], [1, 1]).expect("a pixel of the frame")
-    }
-
     /// The frame that it is a part of.
     pub fn frame(self) -> Size {
         self.frame

@@ -3,7 +3,10 @@
 use glam::{DVec2, DVec3};
 
 use super::emitter_tree::{Twig, build_tree};
-use crate::prepared::record::{EmitterNode, EmitterRecord, LightRecord, MaterialRecord, NO_NODE};
+use crate::{
+    exact::clip::clip,
+    prepared::record::{EmitterNode, EmitterRecord, LightRecord, MaterialRecord, NO_NODE},
+};
 
 /// The most lights that are asked about one face; of more, every second, third and so on stands
 /// for those between.
@@ -172,11 +175,12 @@ pub(crate) fn within(corners: &[DVec3], (min, max): (DVec3, DVec3)) -> Option<[D
     let (min, max) = (min - slack, max + slack);
     // Places as shares of the two sides.
     let mut outline = vec![DVec2::ZERO, DVec2::X, DVec2::ONE, DVec2::Y];
+    let mut room = Vec::new();
     for axis in 0..3 {
         for (bound, sign) in [(min[axis], 1.0), (max[axis], -1.0)] {
             let height =
                 |at: DVec2| sign * (start[axis] + at.x * right[axis] + at.y * up[axis] - bound);
-            outline = clip(&outline, height);
+            clip(&mut outline, &mut room, height, |p, q, share| p + (q - p) * share);
         }
     }
     let none = (DVec2::ONE, DVec2::ZERO);
@@ -186,22 +190,4 @@ pub(crate) fn within(corners: &[DVec3], (min, max): (DVec3, DVec3)) -> Option<[D
         [(low.x, low.y), (high.x, low.y), (high.x, high.y), (low.x, high.y)]
             .map(|(x, y)| start + x * right + y * up)
     })
-}
-
-/// The part of a convex outline where `height` is not below 0.
-///
-/// Source: Sutherland & Hodgman, "Reentrant Polygon Clipping" (1974).
-fn clip(outline: &[DVec2], height: impl Fn(DVec2) -> f64) -> Vec<DVec2> {
-    let mut clipped = Vec::new();
-    for (k, &p) in outline.iter().enumerate() {
-        let q = outline[(k + 1) % outline.len()];
-        let (at_p, at_q) = (height(p), height(q));
-        if at_p >= 0.0 {
-            clipped.push(p);
-        }
-        if (at_p >= 0.0) != (at_q >= 0.0) {
-            clipped.push(p + (q - p) * (at_p / (at_p - at_q)));
-        }
-    }
-    clipped
 }

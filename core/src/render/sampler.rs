@@ -8,7 +8,7 @@ use super::{
     pixel::Pixel,
     settings::{Quality, Sampling},
     tally::Tally,
-    unseen::{Beams, Look, Unseen},
+    unseen::{FirstSamples, UnseenFaces, UnseenSearch},
     wavefront::{CameraSample, Wavefront},
 };
 use crate::{
@@ -94,7 +94,7 @@ impl<'a> Sampler<'a> {
             pixels[pixel as usize].set_contrast(contrast);
         }
         let quality = self.quality;
-        let beams = Beams::new(self.view, area.frame(), quality.flat, error);
+        let beams = UnseenSearch::new(self.view, area.frame(), quality.flat, error);
         let mut hidden = match beams {
             Some(beams) => self.find_hidden(beams, area, wide, &mut pixels, &hits)?,
             None => Hidden::default(),
@@ -117,7 +117,7 @@ impl<'a> Sampler<'a> {
     /// Finds what may hide in the pixels of `area`, from the first samples of `wide`.
     fn find_hidden(
         &mut self,
-        mut beams: Beams<'a>,
+        mut beams: UnseenSearch<'a>,
         area: Area,
         wide: Area,
         pixels: &mut [Pixel],
@@ -130,7 +130,7 @@ impl<'a> Sampler<'a> {
             let look = |x: u32, y: u32| {
                 let pixel = wide.index_of(x, y);
                 let first = pixel as usize * FEWEST_FOR_ERROR as usize;
-                Look {
+                FirstSamples {
                     hits: &hits[first..first + FEWEST_FOR_ERROR as usize],
                     samples: Samples::new(FEWEST_FOR_ERROR, seed, x, y),
                     mean: pixels[pixel as usize].mean(),
@@ -190,9 +190,9 @@ impl<'a> Sampler<'a> {
 /// What may hide in pixels.
 #[derive(Default)]
 struct Hidden<'a> {
-    beams: Option<Beams<'a>>,
+    beams: Option<UnseenSearch<'a>>,
     /// Pixels, by how many of their samples they are up to, and what none of those passed.
-    found: Vec<(u32, u32, Unseen)>,
+    found: Vec<(u32, u32, UnseenFaces)>,
 }
 
 impl Hidden<'_> {
@@ -207,7 +207,7 @@ impl Hidden<'_> {
                 continue;
             }
             let places = (*had..pixel.count()).map(|number| samples.sample(number).place(x, y));
-            beams.pass(unseen, places, pixel.count());
+            beams.note_samples(unseen, places, pixel.count());
             *had = pixel.count();
             pixel.set_hidden(unseen.variance(*had));
         }

@@ -19,7 +19,7 @@ use crate::{
     shade::{
         optics::{mirror, refract},
         point::{Interaction, Point},
-        ray_differential::Spread,
+        ray_differential::RayDifferential,
     },
     tile::Size,
     trace::{
@@ -73,8 +73,8 @@ pub(super) struct Wavefront {
 struct RayQueue {
     rays: Vec<Ray>,
     branches: Vec<Branch>,
-    /// How wide each ray's sample is; empty in a scene without textures.
-    spreads: Vec<Spread>,
+    /// Empty in a scene without textures.
+    differentials: Vec<RayDifferential>,
 }
 
 /// A ray of the tree that a camera ray grows into.
@@ -93,14 +93,14 @@ impl RayQueue {
     fn clear(&mut self) {
         self.rays.clear();
         self.branches.clear();
-        self.spreads.clear();
+        self.differentials.clear();
     }
 
     #[inline(always)]
-    fn push(&mut self, ray: Ray, branch: Branch, spread: Option<Spread>) {
+    fn push(&mut self, ray: Ray, branch: Branch, differential: Option<RayDifferential>) {
         self.rays.push(ray);
         self.branches.push(branch);
-        self.spreads.extend(spread);
+        self.differentials.extend(differential);
     }
 }
 
@@ -142,10 +142,10 @@ impl Wavefront {
             let u = (f64::from(x) + across) / f64::from(frame.width());
             let v = (f64::from(y) + down) / f64::from(frame.height());
             let direction = screen[0] + u * screen[1] + v * screen[2];
-            let spread = has_textures.then(|| {
+            let differential = has_textures.then(|| {
                 let steps = [(1, frame.width()), (2, frame.height())]
                     .map(|(side, count)| screen[side] * (width / f64::from(count)));
-                Spread::of_camera(direction, steps)
+                RayDifferential::of_camera(direction, steps)
             });
             let ray = Ray {
                 origin: DVec3::from_array(camera.eye),
@@ -154,7 +154,11 @@ impl Wavefront {
                 leaving: Surface::NONE,
                 after: Ray::NOTHING_AHEAD,
             };
-            self.queue.push(ray, Branch { sample: number, weight: 1.0, node: 0, depth: 0 }, spread);
+            self.queue.push(
+                ray,
+                Branch { sample: number, weight: 1.0, node: 0, depth: 0 },
+                differential,
+            );
         }
         let count = self.queue.rays.len();
         self.colors.clear();
@@ -222,11 +226,11 @@ impl Wavefront {
     fn meet<const HAS_TEXTURES: bool>(&mut self, view: &View<'_>, index: usize, cutoff: f64) {
         let (ray, branch) = (self.queue.rays[index], self.queue.branches[index]);
         let at = Interaction::new(view, &ray, &self.hits[index]);
-        let spread = HAS_TEXTURES
-            .then(|| self.queue.spreads[index].transfer(ray.direction, at.t, at.normal));
-        self.shade(view, &ray, branch, &at, spread);
+        let differential = HAS_TEXTURES
+            .then(|| self.queue.differentials[index].transfer(ray.direction, at.t, at.normal));
+        self.shade(view, &ray, branch, &at, differential);
         if view.header.features.has_branches() {
-            self.branch(view, &ray, branch, &at, spread, cutoff);
+            self.branch(view, &ray, branch, &at, differential, cutoff);
         }
     }
 
@@ -238,11 +242,12 @@ impl Wavefront {
         ray: &Ray,
         branch: Branch,
         at: &Interaction<'_>,
-        spread: Option<Spread>,
+        differential: Option<RayDifferential>,
     ) {
         let (reflect, alpha) = (at.material.reflect, at.material.alpha);
         if reflect < 1.0 && alpha > 0.0 {
-            let patch = spread.map(|spread| spread.patch(ray.direction, at.normal));
+            let footprint =
+                differential.map(|differential| differential.footprint(ray.direction, at.normal));
             self.points.push(Point {
                 sample: branch.sample,
                 node: branch.node,
@@ -250,7 +255,7 @@ impl Wavefront {
                 position: at.position,
                 normal: at.normal,
                 surface: at.surface,
-                color: at.color(view, patch),
+                color: at.color(view, footprint),
                 light: view.header.lighting.ambient(),
             });
         }
@@ -264,7 +269,7 @@ impl Wavefront {
         ray: &Ray,
         branch: Branch,
         at: &Interaction<'_>,
-        spread: Option<Spread>,
+        differential: Option<RayDifferential>,
         cutoff: f64,
     ) {
         let Branch { sample, weight, node, depth } = branch;
@@ -273,7 +278,7 @@ impl Wavefront {
                           after: u32,
                           weight: f64,
                           number: u64,
-                          spread: Option<Spread>| {
+                          differential: Option<RayDifferential>| {
             if weight < cutoff || depth == DEEPEST {
                 self.untraced[sample] += weight;
                 return;
@@ -281,15 +286,19 @@ impl Wavefront {
             let (origin, leaving) = (at.position, at.surface);
             let ray = Ray { origin, direction, reach: f64::INFINITY, leaving, after };
             let node = node_after(node, number);
-            self.next_queue.push(ray, Branch { sample, weight, node, depth: depth + 1 }, spread);
+            self.next_queue.push(
+                ray,
+                Branch { sample, weight, node, depth: depth + 1 },
+                differential,
+            );
         };
         let cosine = -at.normal.dot(ray.direction);
         let mirrored = mirror(ray.direction, at.normal, cosine);
-        let curvature = if spread.is_some() { at.curvature(view) } else { 0.0 };
-        let mirrored_spread =
-            spread.map(|spread| spread.mirror(ray.direction, at.normal, curvature));
+        let curvature = if differential.is_some() { at.curvature(view) } else { 0.0 };
+        let mirrored_differential = differential
+            .map(|differential| differential.mirror(ray.direction, at.normal, curvature));
         if reflect > 0.0 && !left_out::MIRROR {
-            follow(mirrored, Ray::NOTHING_AHEAD, weight * reflect, 1, mirrored_spread);
+            follow(mirrored, Ray::NOTHING_AHEAD, weight * reflect, 1, mirrored_differential);
         }
         if reflect < 1.0 && alpha < 1.0 && !left_out::TRANSPARENCY {
             let weight = weight * ((1.0 - reflect) * (1.0 - alpha));
@@ -302,13 +311,14 @@ impl Wavefront {
             };
             match bent {
                 Some(direction) => {
-                    let refract =
-                        |spread: Spread| spread.refract(ray.direction, at.normal, curvature, ratio);
-                    let bent = if is_straight { spread } else { spread.map(refract) };
+                    let refract = |differential: RayDifferential| {
+                        differential.refract(ray.direction, at.normal, curvature, ratio)
+                    };
+                    let bent = if is_straight { differential } else { differential.map(refract) };
                     follow(direction, at.rank, weight, 2, bent);
                 }
                 // Total reflection.
-                None => follow(mirrored, Ray::NOTHING_AHEAD, weight, 2, mirrored_spread),
+                None => follow(mirrored, Ray::NOTHING_AHEAD, weight, 2, mirrored_differential),
             }
         }
     }

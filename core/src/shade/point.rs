@@ -2,7 +2,7 @@
 
 use glam::DVec3;
 
-use super::{ray_differential::Patch, texture::texture_color};
+use super::{ray_differential::SurfaceFootprint, texture::texture_color};
 use crate::{
     left_out,
     prepared::{
@@ -52,15 +52,25 @@ impl<'a> Interaction<'a> {
         }
     }
 
-    /// The face's colour, its texture included, of which the sample sees `patch`. There is none in
+    /// The face's colour, its texture included, of which the sample sees `footprint`. There is none in
     /// a scene without textures.
     #[inline(always)]
-    pub(crate) fn color(&self, view: &View<'_>, patch: Option<Patch>) -> DVec3 {
+    pub(crate) fn color(&self, view: &View<'_>, footprint: Option<SurfaceFootprint>) -> DVec3 {
         let color = DVec3::from_array(self.material.color);
-        match patch {
-            Some(patch) if self.material.texture != MaterialRecord::PLAIN && !left_out::TEXTURE => {
+        match footprint {
+            Some(footprint)
+                if self.material.texture != MaterialRecord::PLAIN && !left_out::TEXTURE =>
+            {
                 let at = (self.position, self.outward);
-                color * texture_color(view, self.material.texture, self.face, self.rank, at, patch)
+                color
+                    * texture_color(
+                        view,
+                        self.material.texture,
+                        self.face,
+                        self.rank,
+                        at,
+                        footprint,
+                    )
             }
             _ => color,
         }
