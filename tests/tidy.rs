@@ -121,7 +121,9 @@ fn rooms_of_core() -> Vec<Room> {
         .map(|path| {
             let text = fs::read_to_string(&path).unwrap();
             let code = text.split("#[cfg(test)]").next().unwrap();
-            let code: String = code.lines().map(|line| line.split("//").next().unwrap()).collect();
+            let code: Vec<&str> =
+                code.lines().map(|line| line.split("//").next().unwrap()).collect();
+            let code = code.join("\n");
             let file = path.strip_prefix(&source).unwrap().to_owned();
             let module = module_of(&file);
             let parent = &module[..module.len().saturating_sub(1)];
@@ -135,7 +137,10 @@ fn rooms_of_core() -> Vec<Room> {
                     child if children.contains(child) => [&module, &words[..]].concat(),
                     _ => continue,
                 };
-                imports.extend(file_with(&source, &named));
+                // The room that the file stands in is named by `pub(in ...)`.
+                if !module.starts_with(&named) {
+                    imports.extend(file_with(&source, &named));
+                }
             }
             imports.remove(&file);
             Room { file, imports }
@@ -254,6 +259,8 @@ fn no_files_of_the_core_import_each_other_in_a_circle() {
             break;
         }
     }
-    let left: Vec<_> = rooms.iter().map(|room| room.file.display().to_string()).collect();
-    assert!(left.is_empty(), "these import each other, or what does: {}", left.join(", "));
+    for Room { file, imports } in &rooms {
+        eprintln!("{} imports {imports:?}", file.display());
+    }
+    assert!(rooms.is_empty(), "these files import each other, or import some that do");
 }
