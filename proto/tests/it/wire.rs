@@ -4,7 +4,7 @@
 use std::{fs, path::Path};
 
 #[expect(clippy::needless_pass_by_value, reason = "a message goes with its check")]
-#[path = "../../fuzz/wire.rs"]
+#[path = "../../../fuzz/wire.rs"]
 mod targets;
 
 fn corpus() -> Vec<Vec<u8>> {
