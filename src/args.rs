@@ -10,6 +10,7 @@ use rtfarm_core::{
     transfer::Transfer,
 };
 use rtfarm_job::RenderRequest;
+use rtfarm_ladder::Effort;
 use rtfarm_picture::PictureFormat;
 use rtfarm_proto::Address;
 
@@ -35,7 +36,7 @@ pub(crate) enum Command {
     Submit(SubmitArgs),
     /// Say what is wrong with a scene, and what it needs.
     Check(CheckArgs),
-    /// Measure speed against error.
+    /// Measure speed against error of a scene, whose picture at many samples stands for the truth.
     Report(ReportArgs),
 }
 
@@ -74,10 +75,9 @@ pub(crate) struct CheckArgs {
 
 #[derive(Debug, ClapArgs)]
 pub(crate) struct ReportArgs {
-    /// The scene to measure, against its own picture at many samples; pictures with closed forms
-    /// by default.
+    /// The scene to measure.
     #[arg(value_name = "SCENE")]
-    pub(crate) scene: Option<PathBuf>,
+    scene: PathBuf,
 
     /// The folder that report.md and its plots go into; without it the report goes to standard
     /// output.
@@ -89,28 +89,8 @@ pub(crate) struct ReportArgs {
     pub(crate) effort: Effort,
 
     /// The error of SCENE's picture that is wanted, where 1 is full light; some by default.
-    #[arg(long, value_name = "ERROR", requires = "scene", value_parser = parse_error)]
+    #[arg(long, value_name = "ERROR", value_parser = parse_error)]
     pub(crate) wanted: Option<f64>,
-
-    /// A folder with what other programs made of the scenes and rays of `--for-peers`, to stand
-    /// beside rtfarm's.
-    #[arg(long, value_name = "DIR", conflicts_with = "scene")]
-    pub(crate) peers: Option<PathBuf>,
-
-    /// Only write these scenes and rays into a folder, for the same effort.
-    #[arg(long, value_name = "DIR", conflicts_with_all = ["scene", "peers", "out"])]
-    pub(crate) for_peers: Option<PathBuf>,
-}
-
-/// How much work goes into a report.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
-pub(crate) enum Effort {
-    /// Some seconds: whether it works.
-    Smoke,
-    /// Some minutes.
-    Quick,
-    /// Figures worth publishing.
-    Full,
 }
 
 /// What picture is wanted.
@@ -313,8 +293,8 @@ impl FromStr for IsaChoice {
 
 impl ReportArgs {
     /// The user's own scene.
-    pub(crate) fn scene(&self) -> Option<SceneArgs> {
-        self.scene.clone().map(|path| SceneArgs { path, strict: false })
+    pub(crate) fn scene(&self) -> SceneArgs {
+        SceneArgs { path: self.scene.clone(), strict: false }
     }
 }
 

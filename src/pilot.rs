@@ -6,11 +6,11 @@ use rayon::prelude::*;
 use rtfarm_core::{
     isa::Isa,
     prepared::{PreparedBytes, PreparedScene},
-    render::{Quality, SampleLimit, Sampling, StandardError, render_tile},
-    sample::MOST_SAMPLES,
+    render::{Quality, Sampling, render_tile},
     tile::{Area, Size},
 };
 use rtfarm_job::Order;
+use rtfarm_ladder::adaptive_settings;
 use tokio::time::Instant;
 use tokio_util::sync::CancellationToken;
 
@@ -23,19 +23,7 @@ const SIDE: u32 = 16;
 /// The part of the time that a prediction may take up: it is off by some per cent.
 const PART: f64 = 0.9;
 
-/// The settings from coarse to fine: each asks for an error smaller by √2 than the one before.
-/// Below an 8-bit step pixels may have more samples as well.
-pub(crate) fn ladder() -> impl Iterator<Item = Sampling> {
-    (0..=22).map(|rung: u32| {
-        let halves = f64::from(1_u32 << (rung / 2));
-        let half = if rung.is_multiple_of(2) { 1.0 } else { std::f64::consts::SQRT_2 };
-        let error = 16.0 * StandardError::EIGHT_BIT_STEP.get() / (halves * half);
-        let most = SampleLimit::DEFAULT.get() << rung.saturating_sub(8).min(8);
-        Sampling::adaptive(error, most.min(MOST_SAMPLES)).expect("both are in range")
-    })
-}
-
-/// Chooses the finest setting of the ladder with which `threads` threads render the picture in
+/// Chooses the finest of the [`adaptive_settings`] with which `threads` threads render the picture in
 /// `time`, what the choice itself takes included; the coarsest where none does. `None` when `stop`
 /// came first. Never call this on the async runtime.
 pub(crate) fn choose(
@@ -52,7 +40,7 @@ pub(crate) fn choose(
     let pixels: usize = squares.iter().map(|square| square.pixel_count()).sum();
     let whole = size.pixel_count() as f64 / pixels as f64;
     let mut chosen = None;
-    for sampling in ladder() {
+    for sampling in adaptive_settings() {
         let quality = Quality { sampling, ..order.settings.quality };
         let rung_started = Instant::now();
         let is_whole = pool.install(|| {
@@ -77,7 +65,7 @@ pub(crate) fn choose(
         }
         chosen = Some(sampling);
     }
-    Ok(chosen.or_else(|| ladder().next()))
+    Ok(chosen.or_else(|| adaptive_settings().next()))
 }
 
 /// Squares all over the frame.
@@ -104,19 +92,6 @@ fn squares(size: Size) -> Vec<Area> {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn the_ladder_falls_and_every_rung_can_be_asked_for() {
-        let rungs: Vec<Sampling> = ladder().collect();
-        let errors: Vec<StandardError> = (rungs.iter())
-            .map(|rung| match *rung {
-                Sampling::Adaptive { error, .. } => error,
-                Sampling::Fixed(_) => panic!("{rung:?}"),
-            })
-            .collect();
-        assert!(errors.is_sorted_by(|a, b| a > b), "{errors:?}");
-        assert!(rungs.contains(&Quality::default().sampling));
-    }
 
     #[test]
     fn squares_lie_in_the_frame() {

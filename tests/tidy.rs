@@ -46,8 +46,50 @@ fn check_never_names(files: &[PathBuf], words: &[&str]) {
 
 #[test]
 fn the_core_opens_no_files_reads_no_clock_and_uses_no_sockets() {
-    let words = ["tokio", "tonic", "std::net", "File::open", "fs::read", "Instant", "SystemTime"];
+    let words =
+        ["tokio", "tonic", "std::net", "fs::", "std::os", "tempfile", "Instant", "SystemTime"];
     check_never_names(&rust_files("core/src"), &words);
+}
+
+#[test]
+fn a_job_knows_no_wire_no_runtime_and_no_clock() {
+    check_never_names(&rust_files("job/src"), &["tokio", "tonic", "proto", "WorkerId", "Instant"]);
+}
+
+/// The packages of the project that a package depends on, tests aside.
+fn dependencies(folder: &str) -> Vec<String> {
+    let text = fs::read_to_string(root().join(folder).join("Cargo.toml")).unwrap();
+    let section = text.split("\n[").find_map(|section| section.strip_prefix("dependencies]"));
+    let names = section.expect(folder).lines().filter_map(|line| line.strip_prefix("rtfarm-"));
+    names.map(|name| name.split(['.', ' ', '=']).next().unwrap().to_owned()).collect()
+}
+
+/// ARCHITECTURE.md draws it: nothing that users run knows the oracle, and what renders alone needs
+/// no server.
+#[test]
+fn packages_depend_on_each_other_as_they_are_drawn() {
+    let arrows: [(&str, &[&str]); 11] = [
+        ("core", &[]),
+        ("picture", &["core"]),
+        ("job", &["core", "picture"]),
+        ("proto", &["core", "picture"]),
+        ("coordinator", &["core", "job", "picture", "proto"]),
+        ("worker", &["core", "proto"]),
+        ("ladder", &["core"]),
+        ("report", &["core", "ladder", "oracle"]),
+        ("tests/oracle", &["core"]),
+        (".", &["coordinator", "core", "job", "ladder", "picture", "proto", "worker"]),
+        ("fuzz", &["core", "picture", "proto"]),
+    ];
+    for (folder, expected) in arrows {
+        assert_eq!(dependencies(folder), expected, "{folder}");
+    }
+}
+
+#[test]
+fn rendering_in_one_process_knows_no_server() {
+    let files = ["src/local.rs", "src/pilot.rs", "src/report.rs"].map(|file| root().join(file));
+    check_never_names(&files, &["rtfarm_coordinator", "rtfarm_proto", "rtfarm_worker", "WorkerId"]);
 }
 
 #[test]
@@ -61,11 +103,25 @@ fn the_coordinator_traces_no_rays() {
     check_never_names(&rust_files("coordinator/src"), &["render_tile", "trace("]);
 }
 
+/// The code of every package.
+const SOURCES: [&str; 10] = [
+    "core/src",
+    "picture/src",
+    "job/src",
+    "proto/src",
+    "coordinator/src",
+    "worker/src",
+    "ladder/src",
+    "report/src",
+    "tests/oracle/src",
+    "src",
+];
+
 #[test]
 fn unsafe_code_lives_in_three_modules() {
     let allowed = ["core/src/trace/boxes_x86.rs", "src/source.rs", "worker/src/map.rs"];
     let words = ["unsafe {", "unsafe fn", "unsafe impl", "unsafe extern", "unsafe trait"];
-    for folder in ["core/src", "proto/src", "coordinator/src", "worker/src", "src"] {
+    for folder in SOURCES {
         for file in rust_files(folder) {
             let text = fs::read_to_string(&file).unwrap();
             let relative = file.strip_prefix(root()).unwrap().to_str().unwrap().to_owned();

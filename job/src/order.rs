@@ -106,3 +106,63 @@ impl RenderRequest {
         Ok(Order { name, prepared, settings, grid, transfer, format })
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use std::io;
+
+    use super::*;
+
+    const VIEWPORT: &str = "viewport origin 0 0 9 topleft -1 1 0 bottomleft -1 -1 0 topright 1 1 0
+        size 64 32 endviewport\n";
+
+    fn request() -> RenderRequest {
+        RenderRequest {
+            name: "scene".to_owned(),
+            strict: false,
+            size: None,
+            quality: Quality::default(),
+            tile_side: None,
+            transfer: Transfer::None,
+            format: PictureFormat::Png8,
+        }
+    }
+
+    fn place(request: RenderRequest, text: &str) -> Placed {
+        request.place(text.as_bytes(), &|_| Err(io::Error::other("there are no files")))
+    }
+
+    #[test]
+    fn a_size_that_is_asked_for_counts_more_than_the_scenes_own() {
+        let order = place(request(), VIEWPORT).order.unwrap();
+        assert_eq!(order.settings.size, Size::new(64, 32).unwrap());
+        let size = Size::new(20, 10).unwrap();
+        let wanted = RenderRequest { size: Some(size), ..request() };
+        let order = place(wanted, VIEWPORT).order.unwrap();
+        assert_eq!(order.settings.size, size);
+    }
+
+    #[test]
+    fn too_many_tiles_are_refused() {
+        let size = Some(Size::new(65_535, 65_535).unwrap());
+        let wanted = RenderRequest { size, tile_side: Some(16), ..request() };
+        let refused = place(wanted, VIEWPORT).order.unwrap_err();
+        let Refusal::Other(reason) = refused else { panic!("the scene is innocent") };
+        assert!(reason.contains("would be 16777216"), "{reason}");
+    }
+
+    #[test]
+    fn a_strict_request_refuses_a_scene_with_a_warning() {
+        let text = VIEWPORT.replace("size", "fog 3\n size");
+        let placed = place(request(), &text);
+        assert!(placed.order.is_ok() && placed.diagnostics.len() == 1, "{placed:?}");
+        let placed = place(RenderRequest { strict: true, ..request() }, &text);
+        assert!(matches!(placed.order, Err(Refusal::Scene)), "{placed:?}");
+    }
+
+    #[test]
+    fn a_scene_without_a_viewport_is_refused() {
+        let order = place(request(), "").order;
+        assert!(order.is_err(), "{order:?}");
+    }
+}

@@ -1,41 +1,22 @@
-//! The report's text, in Markdown.
+//! The report's text, in Markdown, and the plot of its kernels.
 
 use std::fmt::Write;
 
-use rtfarm_core::isa::Isa;
-
-use super::{
-    figures::{Errors, Spread, decimals, mean_and_band, median, slope},
-    kernels::{Amount, Case, Kernel, names},
-    ladder::{Ladder, Rung},
-    plot,
+use rtfarm_ladder::{
+    ERROR_PLOT, Ladder, Rung,
+    figures::{Quartiles, decimals, median, slope},
+    plot::{Legend, Panel, PlotError, draw},
+    tables::{LEGEND, WANTED, method, table},
 };
-use crate::VERSION;
 
-/// The errors that a user may want, in 8-bit steps.
-const WANTED: [f64; 5] = [8.0, 4.0, 2.0, 1.0, 0.5];
+use crate::kernels::{Amount, Case, Kernel, names};
 
-const LEGEND: &str = "Errors are of a channel, 1 is full light. `ms`: of one thread. `relMSE`: the \
-    mean of error² / (truth² + 0.01). `FLIP`: the mean difference to the eye in 8 bits, 0 to 1. \
-    `p99.9`: what one channel in a thousand exceeds. `mean`: with its sign; one that does not fall \
-    with more samples is bias. `stopped`: the share of channels further off than three times the \
-    error asked for. `told`: the error that a render tells over the true one.\n\n";
-
-/// The report on a user's scene.
-pub(super) fn on_scene(ladder: &Ladder, wanted: Option<f64>) -> String {
-    let samples = ladder.reference.map_or(0, |reference| reference.samples);
-    let mut text = format!(
-        "# Speed against error\n\nTruth is the picture at {samples} samples a pixel. {LEGEND}",
-    );
-    text += &soonest(ladder, wanted);
-    text += &table(ladder);
-    let _ = write!(text, "![error against time]({})\n\n", plot::ERROR_FILE);
-    text += &method(std::slice::from_ref(ladder), None);
-    text
-}
+/// The plots beside that of error against time.
+pub(crate) const PEERS_PLOT: &str = "peers.svg";
+pub(crate) const KERNEL_PLOT: &str = "kernels.svg";
 
 /// The report on pictures and distances that are known; `beside` other renderers.
-pub(super) fn on_known(
+pub(crate) fn on_known(
     ladders: &[Ladder],
     beside: &[Ladder],
     cases: &[Case],
@@ -43,8 +24,7 @@ pub(super) fn on_known(
 ) -> String {
     let mut text = format!(
         "# Speed against error\n\nTruth is a closed form for every pixel. {LEGEND}\
-         ![error against time]({})\n\n",
-        plot::ERROR_FILE
+         ![error against time]({ERROR_PLOT})\n\n"
     );
     text.extend(ladders.iter().map(table));
     text += &summary(ladders);
@@ -52,114 +32,13 @@ pub(super) fn on_known(
         text += &peers(beside);
     }
     text += &kernels(cases, amount);
-    text += &method(ladders, Some(amount));
-    text
-}
-
-/// How the figures came about.
-fn method(ladders: &[Ladder], kernels: Option<Amount>) -> String {
-    let seeds = ladders.first().map_or(0, |ladder| ladder.fixed()[0].errors.len());
-    let profile = if cfg!(debug_assertions) { "a debug build" } else { "a release build" };
-    let mut text = format!(
-        "## Method\n\nrtfarm {VERSION}, {profile} for {arch} without flags for the CPU, on {cpu}, \
-         {threads} hardware threads; kernel {isa}. One thread a picture, as many pictures at a \
-         time as there are hardware threads; seeds 0 to {last}, and for each seed all kinds of a \
-         rung in turn. A time is the median and, in brackets, the quartiles of {seeds} runs; ± is \
-         the 95 % band of the mean by the normal law; a slope is fitted to logarithms.\n",
-        arch = std::env::consts::ARCH,
-        cpu = cpu_name(),
-        threads = std::thread::available_parallelism().map_or(0, usize::from),
-        isa = Isa::fastest(),
-        last = seeds.saturating_sub(1),
+    text += &method(ladders);
+    let _ = writeln!(
+        text,
+        "\nKernels run alone on one thread, each in turn, {} times; the median and the quartiles of \
+         those. The time includes the copy of a ray into the tracer's own form.",
+        amount.runs
     );
-    if let Some(Amount { runs, .. }) = kernels {
-        let _ = writeln!(
-            text,
-            "\nKernels run alone on one thread, each in turn, {runs} times; the median and the \
-             quartiles of those. The time includes the copy of a ray into the tracer's own form."
-        );
-    }
-    text
-}
-
-fn cpu_name() -> String {
-    let info = std::fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
-    let name = info.lines().find_map(|line| line.strip_prefix("model name"));
-    name.map_or("an unknown CPU", |name| name.trim_start_matches([' ', '\t', ':'])).to_owned()
-}
-
-fn table(ladder: &Ladder) -> String {
-    let mut text = format!("### {}, {}\n\n", ladder.name, ladder.size);
-    text += "| setting | samples | ms | RMSE | relMSE | 8-bit RMSE | FLIP | p99.9 | max | mean | stopped | told |\n\
-             |---|---|---|---|---|---|---|---|---|---|---|---|\n";
-    for rung in ladder.rungs() {
-        text += &row(rung);
-    }
-    for series in &ladder.series {
-        let points = series.rungs.iter().map(|rung| (rung.time(), rung.rmse().0));
-        if let Some(slope) = slope(points) {
-            let _ = writeln!(text, "\nRMSE falls as time^{slope:.2} ({}).", series.name);
-        }
-    }
-    text.push('\n');
-    text
-}
-
-fn row(rung: &Rung) -> String {
-    let of = |value: fn(&Errors) -> f64| mean_and_band(rung.errors.iter().map(value));
-    // A band needs more than one picture.
-    let banded = |(value, band): (f64, f64), digits: usize| {
-        if rung.errors.len() > 1 {
-            format!("{value:.digits$e} ± {band:.0e}")
-        } else {
-            format!("{value:.digits$e}")
-        }
-    };
-    let stopped = rung.errors[0].wrongly_stopped.map_or(String::new(), |_| {
-        let (share, _) = of(|errors| errors.wrongly_stopped.unwrap_or(0.0));
-        format!("{:.3} %", 100.0 * share)
-    });
-    let told =
-        if rung.told.is_empty() { String::new() } else { format!("{:.2}", median(&rung.told)) };
-    format!(
-        "| {setting} | {samples} | {ms} | {rmse} | {relative:.1e} | {rounded:.1e} | {flip:.1e} | \
-         {high:.1e} | {worst:.1e} | {mean} | {stopped} | {told} |\n",
-        setting = rung.setting,
-        samples = rung.samples_a_pixel.map_or(String::new(), |samples| format!("{samples:.1}")),
-        ms = Spread::new(&rung.milliseconds),
-        rmse = banded(rung.rmse(), 2),
-        relative = of(|errors| errors.relative).0,
-        rounded = of(|errors| errors.rmse_8_bit).0,
-        flip = of(|errors| errors.flip).0,
-        high = of(|errors| errors.high).0,
-        worst = rung.errors.iter().map(|errors| errors.worst).fold(0.0, f64::max),
-        mean = banded(of(|errors| errors.mean), 0),
-    )
-}
-
-/// Which setting comes first to an error.
-fn soonest(ladder: &Ladder, wanted: Option<f64>) -> String {
-    let full_size = ladder.reference.map_or(ladder.size, |reference| reference.full_size);
-    let larger = full_size.pixel_count() as f64 / ladder.size.pixel_count() as f64;
-    let mut text = format!(
-        "## Soonest to an error\n\nAt {full_size} a picture is estimated to take {larger:.1} times \
-         as long as here, where it has {}; more threads share that.\n\n\
-         | RMSE | setting | ms here | s at {full_size} |\n|---|---|---|---|\n",
-        ladder.size
-    );
-    let steps = WANTED.map(|steps| (format!("{steps}/255"), steps / 255.0));
-    let wanted = wanted.map_or(steps.to_vec(), |error| vec![(format!("{error}"), error)]);
-    for (name, wanted) in wanted {
-        let good = ladder.rungs().filter(|rung| rung.rmse().0 <= wanted);
-        let found = good.min_by(|a, b| a.time().total_cmp(&b.time()));
-        let (setting, time, large) =
-            found.map_or(("none of these".to_owned(), String::new(), String::new()), |rung| {
-                let spread = Spread::new(&rung.milliseconds).to_string();
-                (rung.setting.clone(), spread, format!("{:.2}", rung.time() * larger / 1e3))
-            });
-        let _ = writeln!(text, "| {name} | {setting} | {time} | {large} |");
-    }
-    text.push('\n');
     text
 }
 
@@ -213,12 +92,11 @@ fn peers(ladders: &[Ladder]) -> String {
         "## Beside other renderers\n\nThe same scenes, sizes and truths, one thread each. Times are \
          those that a renderer tells of its tracing, without reading the scene or writing the \
          picture; pictures are of 16 bits a channel and one each, for most have no seeds. What a \
-         renderer cannot express is left out.\n\n![peers]({})\n\n\
+         renderer cannot express is left out.\n\n![peers]({PEERS_PLOT})\n\n\
          Milliseconds to an RMSE, between the two settings beside it by the slope of their \
          logarithms; `-` where no setting measured comes to it, `<` where the first is better \
          already. `stays` is the RMSE that the last settings do not get below: the slope of the last \
          four is above -0.25, which is bias of the renderer or of the way it was asked.\n\n",
-        plot::PEERS_FILE
     );
     text += "| scene | renderer |";
     text.extend(WANTED.map(|steps| format!(" {steps}/255 |")));
@@ -278,12 +156,11 @@ fn kernels(cases: &[Case], amount: Amount) -> String {
          face those are in doubt for which it asks for the digits that f64 products lose. The \
          textbook's tests, in the form that leaves no margin, try every \
          face, so they have no speed.\n\n![kernels]({})\n\n",
-        amount.exact,
-        plot::KERNEL_FILE
+        amount.exact, KERNEL_PLOT
     );
     let speed = |kernel: &Kernel| {
         let speeds = &kernel.speeds;
-        if speeds.is_empty() { String::new() } else { Spread::new(speeds).to_string() }
+        if speeds.is_empty() { String::new() } else { Quartiles::new(speeds).to_string() }
     };
     let is_timed = |name: &str| {
         let mut kernels = cases.iter().flat_map(|case| &case.kernels);
@@ -334,4 +211,31 @@ fn kernel_table(
     }
     text.push('\n');
     text
+}
+
+/// Draws error against rays a second, one panel a place of the mesh: a point a kernel and aim.
+pub(crate) fn draw_kernels(cases: &[Case]) -> Result<String, PlotError> {
+    let panels: Vec<Panel> = cases
+        .chunk_by(|a, b| a.moved == b.moved)
+        .map(|cases| Panel {
+            caption: format!("the mesh moved by {:e}", cases[0].moved),
+            x: "million rays a second",
+            y: "largest relative error",
+            // From double precision to worse than single.
+            y_limits: Some(3e-17..1e-5),
+            is_joined: false,
+            legend: Legend::UpperLeft,
+            series: (names(cases).into_iter())
+                .map(|name| {
+                    let kernels = cases.iter().flat_map(|case| &case.kernels);
+                    let is_drawn =
+                        |kernel: &&Kernel| kernel.name == name && !kernel.speeds.is_empty();
+                    let point = |kernel: &Kernel| [median(&kernel.speeds), kernel.worst, 0.0];
+                    (name.to_owned(), kernels.filter(is_drawn).map(point).collect())
+                })
+                .filter(|(_, points): &(String, Vec<_>)| !points.is_empty())
+                .collect(),
+        })
+        .collect();
+    draw(&panels)
 }

@@ -1,6 +1,6 @@
 //! Kernels: rays through a closed mesh, how many a second, how far off, and how many get through.
 
-use std::collections::BTreeSet;
+use std::{collections::BTreeSet, time::Instant};
 
 use glam::DVec3;
 use rayon::prelude::*;
@@ -12,8 +12,6 @@ use rtfarm_core::{
     testing::{FaceTests, Probe, Probing},
 };
 use rtfarm_oracle::{Oracle, random::Random};
-use tokio::time::Instant;
-use tokio_util::sync::CancellationToken;
 
 /// Triangles along an edge of the octahedron that the mesh is made from: 8 · 45² in all.
 const ALONG: i32 = 45;
@@ -26,7 +24,7 @@ const MOVES: [f64; 4] = [0.0, 1e3, 1e5, 1e9];
 
 /// Where the rays, all of which start inside the mesh, go.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Aim {
+pub(crate) enum Aim {
     Edges,
     Corners,
     Anywhere,
@@ -35,7 +33,7 @@ pub(super) enum Aim {
 impl Aim {
     const ALL: [Self; 3] = [Self::Edges, Self::Corners, Self::Anywhere];
 
-    pub(super) fn name(self) -> &'static str {
+    pub(crate) fn name(self) -> &'static str {
         match self {
             Self::Edges => "edges",
             Self::Corners => "corners",
@@ -46,48 +44,48 @@ impl Aim {
 
 /// How many rays, and how often.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Amount {
-    pub(super) rays: usize,
+pub(crate) struct Amount {
+    pub(crate) rays: usize,
     /// Of those the ones whose true distance is worked out.
-    pub(super) exact: usize,
+    pub(crate) exact: usize,
     /// Of those the ones that the textbook's tests, which try every face, get.
-    pub(super) textbook: usize,
-    pub(super) runs: usize,
+    pub(crate) textbook: usize,
+    pub(crate) runs: usize,
 }
 
 /// A mesh in one place and rays that aim at one thing.
-pub(super) struct Case {
-    pub(super) moved: f64,
-    pub(super) aim: Aim,
-    pub(super) rays: Vec<Probe>,
+pub(crate) struct Case {
+    pub(crate) moved: f64,
+    pub(crate) aim: Aim,
+    pub(crate) rays: Vec<Probe>,
     /// What our own kernels did for them.
-    pub(super) tests: FaceTests,
+    pub(crate) tests: FaceTests,
     /// No kernel in single precision can hold the mesh otherwise.
-    pub(super) is_single: bool,
-    pub(super) kernels: Vec<Kernel>,
+    pub(crate) is_single: bool,
+    pub(crate) kernels: Vec<Kernel>,
 }
 
 /// What one kernel made of the rays of a case.
-pub(super) struct Kernel {
-    pub(super) name: String,
+pub(crate) struct Kernel {
+    pub(crate) name: String,
     /// Millions of rays a second on one thread, of each run; none where every face is tried.
-    pub(super) speeds: Vec<f64>,
-    pub(super) rays: usize,
+    pub(crate) speeds: Vec<f64>,
+    pub(crate) rays: usize,
     /// Rays that got out of the closed mesh.
-    pub(super) leaks: usize,
+    pub(crate) leaks: usize,
     /// The largest relative error of a distance.
-    pub(super) worst: f64,
+    pub(crate) worst: f64,
 }
 
 /// A closed mesh of about 16 000 triangles: a sphere of radius 1.
-pub(super) struct Mesh {
-    pub(super) moved: f64,
-    pub(super) triangles: Vec<[DVec3; 3]>,
+pub(crate) struct Mesh {
+    pub(crate) moved: f64,
+    pub(crate) triangles: Vec<[DVec3; 3]>,
     is_single: bool,
 }
 
 impl Mesh {
-    pub(super) fn all() -> impl Iterator<Item = Self> {
+    pub(crate) fn all() -> impl Iterator<Item = Self> {
         MOVES.into_iter().map(Self::new)
     }
 
@@ -190,25 +188,21 @@ fn in_single(point: DVec3, is_single: bool) -> DVec3 {
 }
 
 /// The ray as a kernel in single precision gets it.
-pub(super) fn rounded(ray: &Probe) -> Probe {
+pub(crate) fn rounded(ray: &Probe) -> Probe {
     Probe { direction: ray.direction.as_vec3().as_dvec3(), ..*ray }
 }
 
 impl Case {
     /// Every mesh with every aim. `others` are kernels of other programs, by what they met: the
-    /// distance of each ray, infinite where it met nothing. `None` when `stop` came first.
-    pub(super) fn measure_all(
+    /// distance of each ray, infinite where it met nothing.
+    pub(crate) fn measure_all(
         amount: Amount,
         others: &dyn Fn(f64, Aim) -> anyhow::Result<Vec<Other>>,
-        stop: &CancellationToken,
-    ) -> anyhow::Result<Option<Vec<Self>>> {
+    ) -> anyhow::Result<Vec<Self>> {
         let mut cases = Vec::new();
         for mesh in Mesh::all() {
             let prepared = mesh.prepared();
             for aim in Aim::ALL {
-                if stop.is_cancelled() {
-                    return Ok(None);
-                }
                 let mut case = Self::new(&mesh, aim, amount.rays);
                 case.measure(&mesh, &prepared, amount);
                 for other in others(mesh.moved, aim)? {
@@ -217,17 +211,17 @@ impl Case {
                 cases.push(case);
             }
         }
-        Ok(Some(cases))
+        Ok(cases)
     }
 
-    pub(super) fn new(mesh: &Mesh, aim: Aim, count: usize) -> Self {
+    pub(crate) fn new(mesh: &Mesh, aim: Aim, count: usize) -> Self {
         let (rays, is_single) = (mesh.rays(aim, count), mesh.is_single);
         let tests = FaceTests::default();
         Self { moved: mesh.moved, aim, rays, tests, is_single, kernels: Vec::new() }
     }
 
     /// All that are there to be measured, in a folder for other programs.
-    pub(super) fn all_of(mesh: &Mesh, count: usize) -> impl Iterator<Item = Self> {
+    pub(crate) fn all_of(mesh: &Mesh, count: usize) -> impl Iterator<Item = Self> {
         Aim::ALL.into_iter().map(move |aim| Self::new(mesh, aim, count))
     }
 
@@ -239,7 +233,7 @@ impl Case {
         let mut speeds = vec![Vec::new(); isas.len()];
         for _ in 0..amount.runs {
             for (isa, speeds) in isas.iter().zip(&mut speeds) {
-                let started = Instant::now();
+                let started = now();
                 for batch in self.rays.chunks(BATCH) {
                     std::hint::black_box(prepared.probe(batch, *isa));
                 }
@@ -280,10 +274,10 @@ impl Case {
 }
 
 /// What another program's kernel made of a case's rays.
-pub(super) struct Other {
-    pub(super) name: String,
-    pub(super) speeds: Vec<f64>,
-    pub(super) distances: Vec<f64>,
+pub(crate) struct Other {
+    pub(crate) name: String,
+    pub(crate) speeds: Vec<f64>,
+    pub(crate) distances: Vec<f64>,
 }
 
 impl Kernel {
@@ -341,8 +335,13 @@ fn textbook_single(ray: &Probe, corners: [DVec3; 3]) -> Option<f64> {
     is_hit.then_some(t.into())
 }
 
+#[expect(clippy::disallowed_methods, reason = "a kernel's time is what is measured")]
+fn now() -> Instant {
+    Instant::now()
+}
+
 /// The kernels of some cases, each once, ours first.
-pub(super) fn names(cases: &[Case]) -> Vec<&str> {
+pub(crate) fn names(cases: &[Case]) -> Vec<&str> {
     let mut seen = BTreeSet::new();
     let kernels = cases.iter().flat_map(|case| &case.kernels);
     kernels.map(|kernel| kernel.name.as_str()).filter(|name| seen.insert(*name)).collect()
@@ -374,8 +373,7 @@ mod tests {
     #[test]
     fn our_kernels_are_exact_and_the_textbooks_leak() {
         let amount = Amount { rays: 600, exact: 20, textbook: 600, runs: 1 };
-        let stop = CancellationToken::new();
-        let cases = Case::measure_all(amount, &|_, _| Ok(Vec::new()), &stop).unwrap().unwrap();
+        let cases = Case::measure_all(amount, &|_, _| Ok(Vec::new())).unwrap();
         assert_eq!(cases.len(), 12);
         for case in &cases {
             // Rounded to a coarse grid many faces lie in one plane; their distance is the plane's,

@@ -1,18 +1,18 @@
-//! What other programs make of the same scenes and rays, through a folder: `report --for-peers`
-//! fills it, some script runs the programs, and `report --peers` reads what they left.
+//! What other programs make of the same scenes and rays, through a folder: `--for-peers` fills it,
+//! some script runs the programs, and `--peers` reads what they left.
 
 use std::{collections::BTreeMap, fs, path::Path};
 
 use anyhow::{Context, bail, ensure};
 use glam::DVec3;
 use rtfarm_core::tile::Size;
+use rtfarm_ladder::{
+    Rung, Series,
+    figures::{Errors, Truth},
+};
 use rtfarm_oracle::known_pictures::known_texts;
 
-use super::{
-    figures::{Errors, Truth},
-    kernels::{Aim, Case, Mesh, Other, rounded},
-    ladder::{Rung, Series},
-};
+use crate::kernels::{Aim, Case, Mesh, Other, rounded};
 
 /// The pictures of others, a line each: scene, renderer, setting, the milliseconds of each run
 /// parted by commas, the picture's file. Tabs part the columns.
@@ -26,7 +26,7 @@ const KERNELS: &str = "kernels.tsv";
 /// Writes what other programs are to work on: every scene of [`known_texts`] as `NAME.rt`,
 /// `size` with the pictures' width and height, `mesh-MOVED` with nine little-endian f32 a triangle
 /// and `rays-MOVED-AIM` with six a ray: origin and direction.
-pub(super) fn write(folder: &Path, size: Size, rays: usize) -> anyhow::Result<()> {
+pub(crate) fn write(folder: &Path, size: Size, rays: usize) -> anyhow::Result<()> {
     fs::create_dir_all(folder)
         .with_context(|| format!("cannot make the folder {}", folder.display()))?;
     let put = |name: &str, bytes: &[u8]| {
@@ -77,7 +77,7 @@ fn numbers(text: &str) -> anyhow::Result<Vec<f64>> {
 }
 
 /// What other renderers made of each scene. `truth_of` knows the scenes.
-pub(super) fn read_pictures<'a>(
+pub(crate) fn read_pictures<'a>(
     folder: &Path,
     truth_of: &dyn Fn(&str) -> Option<&'a Truth>,
 ) -> anyhow::Result<BTreeMap<String, Vec<Series>>> {
@@ -114,7 +114,7 @@ fn read_picture(path: &Path, truth: &Truth, times: &str, setting: String) -> any
 }
 
 /// What other kernels met of one case's rays.
-pub(super) fn read_kernels(folder: &Path, moved: f64, aim: Aim) -> anyhow::Result<Vec<Other>> {
+pub(crate) fn read_kernels(folder: &Path, moved: f64, aim: Aim) -> anyhow::Result<Vec<Other>> {
     let mut others = Vec::new();
     for [name, its_move, its_aim, speeds, file] in lines(&folder.join(KERNELS))? {
         if its_aim != aim.name() || its_move.parse() != Ok(moved) {

@@ -1,25 +1,15 @@
-//! Error against time, and against rays a second, drawn.
+//! Plots with logarithmic axes, as SVG.
 
 use std::ops::Range;
 
-use anyhow::anyhow;
 use plotters::prelude::*;
 
-use super::{
-    figures::median,
-    kernels::{Case, Kernel, names},
-    ladder::Ladder,
-};
-
-/// The plots' files, beside the report.
-pub(super) const ERROR_FILE: &str = "error-against-time.svg";
-pub(super) const PEERS_FILE: &str = "peers.svg";
-pub(super) const KERNEL_FILE: &str = "kernels.svg";
+use crate::Ladder;
 
 /// A panel's size in pixels.
 const PANEL: (u32, u32) = (460, 320);
 
-/// Of the series of a panel, one after the other.
+/// The colours of a panel's series, one after the other.
 const COLORS: [RGBColor; 7] = [
     RGBColor(110, 110, 110),
     RGBColor(200, 30, 30),
@@ -33,8 +23,19 @@ const COLORS: [RGBColor; 7] = [
 type Area<'a> = DrawingArea<SVGBackend<'a>, plotters::coord::Shift>;
 type Failed<'a> = DrawingAreaErrorKind<<SVGBackend<'a> as DrawingBackend>::ErrorType>;
 
-/// One panel a scene, as an SVG: a line a series, with 95 % bands.
-pub(super) fn errors(ladders: &[Ladder]) -> anyhow::Result<String> {
+/// Why a plot cannot be drawn.
+#[derive(Debug, thiserror::Error)]
+#[error("cannot draw a plot: {0}")]
+pub struct PlotError(String);
+
+impl From<Failed<'_>> for PlotError {
+    fn from(failed: Failed<'_>) -> Self {
+        Self(failed.to_string())
+    }
+}
+
+/// Draws error against time, one panel a scene: a line a series, with 95 % bands.
+pub fn draw_errors(ladders: &[Ladder]) -> Result<String, PlotError> {
     let panels: Vec<Panel> = ladders
         .iter()
         .map(|ladder| Panel {
@@ -43,7 +44,7 @@ pub(super) fn errors(ladders: &[Ladder]) -> anyhow::Result<String> {
             y: "RMSE",
             y_limits: None,
             is_joined: true,
-            legend: SeriesLabelPosition::UpperRight,
+            legend: Legend::UpperRight,
             series: (ladder.series.iter())
                 .map(|series| {
                     let points = series.rungs.iter().map(|rung| {
@@ -58,57 +59,47 @@ pub(super) fn errors(ladders: &[Ladder]) -> anyhow::Result<String> {
     draw(&panels)
 }
 
-/// One panel a place of the mesh, as an SVG: a point a kernel and aim.
-pub(super) fn kernels(cases: &[Case]) -> anyhow::Result<String> {
-    let panels: Vec<Panel> = cases
-        .chunk_by(|a, b| a.moved == b.moved)
-        .map(|cases| Panel {
-            caption: format!("the mesh moved by {:e}", cases[0].moved),
-            x: "million rays a second",
-            y: "largest relative error",
-            // From double precision to worse than single.
-            y_limits: Some(3e-17..1e-5),
-            is_joined: false,
-            legend: SeriesLabelPosition::UpperLeft,
-            series: (names(cases).into_iter())
-                .map(|name| {
-                    let kernels = cases.iter().flat_map(|case| &case.kernels);
-                    let is_drawn =
-                        |kernel: &&Kernel| kernel.name == name && !kernel.speeds.is_empty();
-                    let point = |kernel: &Kernel| [median(&kernel.speeds), kernel.worst, 0.0];
-                    (name.to_owned(), kernels.filter(is_drawn).map(point).collect())
-                })
-                .filter(|(_, points): &(String, Vec<_>)| !points.is_empty())
-                .collect(),
-        })
-        .collect();
-    draw(&panels)
+/// One plot: series of points with logarithmic axes.
+#[derive(Debug)]
+pub struct Panel {
+    /// What stands above it.
+    pub caption: String,
+    /// What stands below the horizontal axis.
+    pub x: &'static str,
+    /// What stands beside the vertical axis.
+    pub y: &'static str,
+    /// The ends of the vertical axis; those of the points when missing.
+    pub y_limits: Option<Range<f64>>,
+    /// The points of a series are joined by a line.
+    pub is_joined: bool,
+    /// Where the names of the series stand.
+    pub legend: Legend,
+    /// A name and the points (x, y, half the width of the band of y) of each series.
+    pub series: Vec<(String, Vec<[f64; 3]>)>,
 }
 
-/// Series of (x, y, half a band of y) with logarithmic axes.
-struct Panel {
-    caption: String,
-    x: &'static str,
-    y: &'static str,
-    /// Those of the points otherwise.
-    y_limits: Option<Range<f64>>,
-    is_joined: bool,
-    legend: SeriesLabelPosition,
-    series: Vec<(String, Vec<[f64; 3]>)>,
+/// The corner of a panel that its legend stands in.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Legend {
+    /// The upper left one.
+    UpperLeft,
+    /// The upper right one.
+    UpperRight,
 }
 
-fn draw(panels: &[Panel]) -> anyhow::Result<String> {
+/// Draws panels side by side, two in a row, as one SVG.
+pub fn draw(panels: &[Panel]) -> Result<String, PlotError> {
     let columns = panels.len().clamp(1, 2);
     let rows = panels.len().div_ceil(columns);
     let size = (PANEL.0 * columns as u32, PANEL.1 * rows as u32);
     let mut text = String::new();
     {
         let root = SVGBackend::with_string(&mut text, size).into_drawing_area();
-        root.fill(&WHITE).map_err(|error| anyhow!("{error}"))?;
+        root.fill(&WHITE)?;
         for (panel, area) in panels.iter().zip(root.split_evenly((rows, columns))) {
-            panel.draw(&area).map_err(|error| anyhow!("{error}"))?;
+            panel.draw(&area)?;
         }
-        root.present().map_err(|error| anyhow!("{error}"))?;
+        root.present()?;
     }
     Ok(text)
 }
@@ -129,8 +120,8 @@ impl Panel {
         // Half as wide again, in logarithms.
         let more = if self.series.len() > 2 { (end / start).sqrt().max(2.0) } else { 1.0 };
         match self.legend {
-            SeriesLabelPosition::UpperLeft => start / more..end,
-            _ => start..end * more,
+            Legend::UpperLeft => start / more..end,
+            Legend::UpperRight => start..end * more,
         }
     }
 
@@ -164,6 +155,10 @@ impl Panel {
                 PathElement::new([(x, low), (x, y + band)], color.stroke_width(1))
             }))?;
         }
-        chart.configure_series_labels().position(self.legend.clone()).background_style(WHITE).draw()
+        let legend = match self.legend {
+            Legend::UpperLeft => SeriesLabelPosition::UpperLeft,
+            Legend::UpperRight => SeriesLabelPosition::UpperRight,
+        };
+        chart.configure_series_labels().position(legend).background_style(WHITE).draw()
     }
 }

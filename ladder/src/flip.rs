@@ -41,7 +41,7 @@ type Channel = Vec<f64>;
 
 /// A picture as the eye takes it in.
 #[derive(Debug)]
-pub(super) struct Seen {
+pub(crate) struct Seen {
     size: Size,
     /// Hunt-adjusted L*a*b*, without the detail that is too fine for the eye.
     colors: Vec<[f64; 3]>,
@@ -51,7 +51,7 @@ pub(super) struct Seen {
 
 impl Seen {
     /// A picture of 8 bits a channel on an sRGB screen, row by row.
-    pub(super) fn new(pixels: &[[u8; 3]], size: Size) -> Self {
+    pub(crate) fn new(pixels: &[[u8; 3]], size: Size) -> Self {
         let opponent: Vec<[f64; 3]> = (pixels.iter())
             .map(|pixel| to_opponent(to_xyz(pixel.map(|value| to_linear(value.into())))))
             .collect();
@@ -68,7 +68,7 @@ impl Seen {
     }
 
     /// The mean difference of two pictures of one size: 0 is none, 1 the largest.
-    pub(super) fn mean_difference(&self, other: &Self) -> f64 {
+    pub(crate) fn mean_difference(&self, other: &Self) -> f64 {
         assert_eq!(self.size, other.size);
         let primary = |rgb| hunt_adjusted(to_lab(to_xyz(rgb)));
         let largest = color_distance(primary([0.0, 1.0, 0.0]), primary([0.0, 0.0, 1.0]));

@@ -1,21 +1,25 @@
-//! Pictures against the truth, in numbers.
+//! What is measured: how far pictures are from the truth, and what many runs have in common.
 
 use std::fmt;
 
 use rtfarm_core::tile::Size;
 
-use super::flip::Seen;
+use crate::flip::Seen;
 
 /// A true picture.
-pub(super) struct Truth {
+#[derive(Debug)]
+pub struct Truth {
     /// The mean over each pixel, linear, row by row.
-    pub(super) pixels: Vec<[f64; 3]>,
-    pub(super) size: Size,
+    pub pixels: Vec<[f64; 3]>,
+    /// Its width and height.
+    pub size: Size,
+    /// It as the eye takes it in.
     seen: Seen,
 }
 
 impl Truth {
-    pub(super) fn new(pixels: Vec<[f64; 3]>, size: Size) -> Self {
+    /// Takes the mean over each pixel, linear, row by row, 1 being full light.
+    pub fn new(pixels: Vec<[f64; 3]>, size: Size) -> Self {
         let seen = Seen::new(&in_8_bits(pixels.as_flattened().iter().copied()), size);
         Self { pixels, size, seen }
     }
@@ -29,28 +33,29 @@ fn in_8_bits(channels: impl Iterator<Item = f64>) -> Vec<[u8; 3]> {
 
 /// How far a picture is off. Channels count alike; 1 is full light.
 #[derive(Debug, Clone)]
-pub(super) struct Errors {
+pub struct Errors {
     /// The root of the mean square.
-    pub(super) rmse: f64,
+    pub rmse: f64,
     /// The mean of square / (truth² + 0.01).
-    pub(super) relative: f64,
+    pub relative: f64,
     /// The same as `rmse`, after both were clamped and rounded to 8 bits.
-    pub(super) rmse_8_bit: f64,
+    pub rmse_8_bit: f64,
     /// The mean difference to the eye, 0 to 1, of what is left in 8 bits.
-    pub(super) flip: f64,
-    /// The mean, with its sign.
-    pub(super) mean: f64,
-    /// The largest.
-    pub(super) worst: f64,
-    /// What one channel in a thousand exceeds.
-    pub(super) high: f64,
+    pub flip: f64,
+    /// The mean difference, with its sign.
+    pub mean: f64,
+    /// The largest difference of a channel.
+    pub worst: f64,
+    /// The difference that one channel in a thousand exceeds.
+    pub high: f64,
     /// The share of pixels further off than three times the error that was asked for.
-    pub(super) wrongly_stopped: Option<f64>,
+    pub wrongly_stopped: Option<f64>,
 }
 
 impl Errors {
-    /// `asked` is the error that was asked for.
-    pub(super) fn new(pixels: &[[f32; 3]], truth: &Truth, asked: Option<f64>) -> Self {
+    /// Compares the linear pixels of a picture with the truth of its size. `asked` is the error that
+    /// was asked for.
+    pub fn new(pixels: &[[f32; 3]], truth: &Truth, asked: Option<f64>) -> Self {
         let pairs: Vec<(f64, f64)> = (pixels.as_flattened().iter())
             .zip(truth.pixels.as_flattened())
             .map(|(&found, &truth)| (f64::from(found), truth))
@@ -82,15 +87,18 @@ impl Errors {
 
 /// Where the middle of some values lies, and the middle half of them.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct Spread {
-    pub(super) low: f64,
-    pub(super) median: f64,
-    pub(super) high: f64,
+pub struct Quartiles {
+    /// A quarter of the values is below.
+    pub low: f64,
+    /// Half of the values is below.
+    pub median: f64,
+    /// Three quarters of the values are below.
+    pub high: f64,
 }
 
-impl Spread {
-    /// There is one value at least.
-    pub(super) fn new(values: &[f64]) -> Self {
+impl Quartiles {
+    /// Finds those of one value at least.
+    pub fn new(values: &[f64]) -> Self {
         let mut sorted = values.to_vec();
         sorted.sort_by(f64::total_cmp);
         let at = |quarters: usize| sorted[(quarters * (sorted.len() - 1) + 2) / 4];
@@ -99,7 +107,7 @@ impl Spread {
 }
 
 /// The median and, in brackets, the quartiles: three digits of each.
-impl fmt::Display for Spread {
+impl fmt::Display for Quartiles {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let digits = decimals(self.median);
         let Self { low, median, high } = self;
@@ -107,18 +115,18 @@ impl fmt::Display for Spread {
     }
 }
 
-/// How many show three digits of a number from 1 up.
-pub(super) fn decimals(number: f64) -> usize {
+/// How many digits after the point a number from 1 up is shown with: three digits in all.
+pub fn decimals(number: f64) -> usize {
     [100.0, 10.0].iter().filter(|&&size| number < size).count()
 }
 
-/// The middle one.
-pub(super) fn median(values: &[f64]) -> f64 {
-    Spread::new(values).median
+/// The middle one of some values; there is one at least.
+pub fn median(values: &[f64]) -> f64 {
+    Quartiles::new(values).median
 }
 
-/// The mean and half the width of its 95 % band, by the normal law.
-pub(super) fn mean_and_band(values: impl IntoIterator<Item = f64>) -> (f64, f64) {
+/// The mean of some values and half the width of its 95 % band, by the normal law.
+pub fn mean_and_band(values: impl IntoIterator<Item = f64>) -> (f64, f64) {
     let values: Vec<f64> = values.into_iter().collect();
     let count = values.len() as f64;
     let mean = values.iter().sum::<f64>() / count;
@@ -129,7 +137,7 @@ pub(super) fn mean_and_band(values: impl IntoIterator<Item = f64>) -> (f64, f64)
 /// The slope of the line that fits the points (x, y) best in logarithms; `None` with fewer than
 /// two points above zero.
 #[expect(clippy::disallowed_methods, reason = "a slope reaches no pixel")]
-pub(super) fn slope(points: impl IntoIterator<Item = (f64, f64)>) -> Option<f64> {
+pub fn slope(points: impl IntoIterator<Item = (f64, f64)>) -> Option<f64> {
     let points: Vec<(f64, f64)> = (points.into_iter())
         .filter(|&(x, y)| x > 0.0 && y > 0.0)
         .map(|(x, y)| (x.ln(), y.ln()))
@@ -160,11 +168,11 @@ mod tests {
     }
 
     #[test]
-    fn a_spread_is_the_median_and_the_quartiles() {
-        let spread = Spread::new(&[9.0, 1.0, 3.0, 5.0, 7.0]);
-        assert_eq!(spread, Spread { low: 3.0, median: 5.0, high: 7.0 });
-        assert_eq!(spread.to_string(), "5.00 (3.00–7.00)");
-        assert_eq!(Spread::new(&[123.4]).to_string(), "123 (123–123)");
+    fn the_quartiles_part_the_values_in_four() {
+        let quartiles = Quartiles::new(&[9.0, 1.0, 3.0, 5.0, 7.0]);
+        assert_eq!(quartiles, Quartiles { low: 3.0, median: 5.0, high: 7.0 });
+        assert_eq!(quartiles.to_string(), "5.00 (3.00–7.00)");
+        assert_eq!(Quartiles::new(&[123.4]).to_string(), "123 (123–123)");
     }
 
     #[test]
