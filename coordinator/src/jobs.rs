@@ -6,7 +6,7 @@ use std::{
 };
 
 use rtfarm_core::tile::{TileGrid, TileId};
-use rtfarm_proto::{Epoch, JobId, LONGEST_WAIT, LeaseName, WorkerId};
+use rtfarm_proto::{JobId, LONGEST_WAIT, LeaseId, LeaseName, WorkerId};
 
 use crate::lease::{Again, Leases, Loss, PixelHash, Run, Verdict};
 
@@ -22,7 +22,7 @@ pub(crate) struct Jobs {
     queue: BTreeMap<JobId, Leases>,
     worker_count: u32,
     job_count: u64,
-    epoch_count: u64,
+    last_lease: u64,
 }
 
 #[derive(Debug)]
@@ -54,7 +54,7 @@ impl Jobs {
             queue: BTreeMap::new(),
             worker_count: 0,
             job_count: 0,
-            epoch_count: 0,
+            last_lease: 0,
         }
     }
 
@@ -99,19 +99,19 @@ impl Jobs {
         let member = self.on_sign_of_life(worker, now)?;
         let threads = member.threads;
         let all_threads = self.members.values().map(|member| member.threads).sum();
-        let epoch = Epoch(self.epoch_count + 1);
+        let id = LeaseId(self.last_lease + 1);
         for (&job, leases) in &mut self.queue {
-            let run = leases.on_idle(worker, (threads, all_threads), most, epoch, now);
+            let run = leases.on_idle(worker, (threads, all_threads), most, id, now);
             if let Some(run) = run {
-                self.epoch_count = epoch.0;
+                self.last_lease = id.0;
                 return Ok(Next::Render(job, run));
             }
         }
         let mut ask_again: Option<Instant> = None;
         for (&job, leases) in &mut self.queue {
-            match leases.on_idle_at_the_end(worker, epoch, now) {
+            match leases.on_idle_at_the_end(worker, id, now) {
                 Again::Render(run) => {
-                    self.epoch_count = epoch.0;
+                    self.last_lease = id.0;
                     return Ok(Next::Render(job, run));
                 }
                 Again::Wait(until) => ask_again = ask_again.into_iter().chain(until).min(),
@@ -129,7 +129,7 @@ impl Jobs {
     ) -> Result<Vec<LeaseName>, NoMember> {
         self.on_sign_of_life(worker, now)?;
         let is_lost = |name: &&LeaseName| match self.queue.get_mut(&name.job) {
-            Some(leases) => !leases.on_progress(worker, name.epoch, now),
+            Some(leases) => !leases.on_progress(worker, name.id, now),
             None => true,
         };
         Ok(leases.iter().filter(is_lost).copied().collect())
@@ -150,7 +150,7 @@ impl Jobs {
         now: Instant,
     ) -> Option<Verdict> {
         let leases = self.queue.get_mut(&lease.job)?;
-        let verdict = leases.on_pixels(worker, lease.epoch, tile, hash, now);
+        let verdict = leases.on_pixels(worker, lease.id, tile, hash, now);
         // Pixels are welcome from anyone: a worker may have been given up meanwhile.
         let _ = self.on_sign_of_life(worker, now);
         Some(verdict)
@@ -249,7 +249,7 @@ mod tests {
         let worker = jobs.on_join(1, 1, now);
         let job = submit(&mut jobs, grid(2, 2));
         let Ok(Next::Render(_, run)) = jobs.on_idle(worker, 9, now) else { panic!("a run") };
-        let lease = LeaseName { job, epoch: run.epoch };
+        let lease = LeaseName { job, id: run.lease };
         assert_eq!(jobs.on_progress(worker, &[lease], now), Ok(vec![]));
         jobs.on_end(job);
         assert_eq!(jobs.on_progress(worker, &[lease], now), Ok(vec![lease]));
@@ -257,9 +257,9 @@ mod tests {
     }
 
     /// Steele, Lea & Flood, "Fast Splittable Pseudorandom Number Generators" (2014).
-    struct Dice(u64);
+    struct SplitMix64(u64);
 
-    impl Dice {
+    impl SplitMix64 {
         fn below(&mut self, end: u64) -> u64 {
             self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
             let mut z = self.0;
@@ -285,7 +285,7 @@ mod tests {
     /// How often each tile of two jobs was stitched on a farm where processes die, stall, and
     /// deliver late, twice or never.
     fn simulate(seed: u64) -> [[u32; TILES]; 2] {
-        let mut dice = Dice(seed);
+        let mut random = SplitMix64(seed);
         let mut now = start();
         let mut nonce = 0;
         let mut jobs = Jobs::new(TERM);
@@ -299,28 +299,28 @@ mod tests {
             if stitched.iter().flatten().all(|&count| count > 0) {
                 return stitched;
             }
-            now += Duration::from_millis(dice.below(300));
+            now += Duration::from_millis(random.below(300));
             jobs.on_tick(now);
             if processes.len() < 1 + (seed % 5) as usize {
                 nonce += 1;
-                let worker = jobs.on_join(nonce, 1 + dice.below(3) as usize, now);
+                let worker = jobs.on_join(nonce, 1 + random.below(3) as usize, now);
                 processes.push(Process { worker, queue: VecDeque::new(), stopped_until: now });
             }
-            let index = dice.below(processes.len() as u64) as usize;
-            match dice.below(40) {
+            let index = random.below(processes.len() as u64) as usize;
+            match random.below(40) {
                 0 => {
                     let dead = processes.swap_remove(index);
-                    if dice.one_in(2) {
+                    if random.one_in(2) {
                         jobs.on_worker_lost(dead.worker);
                     }
                     continue;
                 }
-                1 => processes[index].stopped_until = now + TERM * dice.below(4) as u32,
+                1 => processes[index].stopped_until = now + TERM * random.below(4) as u32,
                 _ => {}
             }
             let process = &mut processes[index];
             if process.stopped_until <= now {
-                step(process, &mut jobs, &mut post, &mut dice, now, &mut nonce);
+                step(process, &mut jobs, &mut post, &mut random, now, &mut nonce);
             }
             post.retain(|&(arrival, worker, lease, tile)| {
                 if arrival > now {
@@ -345,14 +345,14 @@ mod tests {
         process: &mut Process,
         jobs: &mut Jobs,
         post: &mut Vec<(Instant, WorkerId, LeaseName, TileId)>,
-        dice: &mut Dice,
+        random: &mut SplitMix64,
         now: Instant,
         nonce: &mut u64,
     ) {
         if let Some((lease, tile)) = process.queue.pop_front() {
-            let copies = [1, 1, 1, 1, 1, 0, 2][dice.below(7) as usize];
+            let copies = [1, 1, 1, 1, 1, 0, 2][random.below(7) as usize];
             for _ in 0..copies {
-                let delay = if dice.one_in(10) { TERM * 3 } else { Duration::from_millis(9) };
+                let delay = if random.one_in(10) { TERM * 3 } else { Duration::from_millis(9) };
                 post.push((now + delay, process.worker, lease, tile));
             }
             let names: Vec<LeaseName> = process.queue.iter().map(|&(lease, _)| lease).collect();
@@ -362,10 +362,10 @@ mod tests {
             }
             return;
         }
-        match jobs.on_idle(process.worker, 1 + dice.below(9) as usize, now) {
+        match jobs.on_idle(process.worker, 1 + random.below(9) as usize, now) {
             // One answer in ten is lost on its way.
-            Ok(Next::Render(job, run)) if !dice.one_in(10) => {
-                let lease = LeaseName { job, epoch: run.epoch };
+            Ok(Next::Render(job, run)) if !random.one_in(10) => {
+                let lease = LeaseName { job, id: run.lease };
                 process.queue.extend(run.tiles.into_iter().map(|tile| (lease, tile)));
             }
             Ok(_) => {}

@@ -6,7 +6,7 @@ use std::{
 };
 
 use rtfarm_core::tile::{TileGrid, TileId};
-use rtfarm_proto::{Epoch, WorkerId};
+use rtfarm_proto::{LeaseId, WorkerId};
 
 /// A finished tile's BLAKE3 hash.
 pub(crate) type PixelHash = [u8; 32];
@@ -34,8 +34,8 @@ pub(crate) struct Leases {
     tiles: Vec<Tile>,
     /// The places of free tiles.
     free: BTreeSet<u32>,
-    held: BTreeMap<Epoch, Lease>,
-    expiries: BTreeSet<(Instant, Epoch)>,
+    held: BTreeMap<LeaseId, Lease>,
+    expiries: BTreeSet<(Instant, LeaseId)>,
 }
 
 #[derive(Debug, Clone, Copy)]
@@ -59,7 +59,7 @@ struct Lease {
 /// A run of tiles for a worker.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct Run {
-    pub(crate) epoch: Epoch,
+    pub(crate) lease: LeaseId,
     pub(crate) tiles: Vec<TileId>,
 }
 
@@ -87,7 +87,7 @@ pub(crate) enum Verdict {
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct Loss {
     pub(crate) worker: WorkerId,
-    pub(crate) epoch: Epoch,
+    pub(crate) lease: LeaseId,
     /// The tiles that had not come, in the order of rendering.
     pub(crate) tiles: Vec<TileId>,
 }
@@ -110,19 +110,19 @@ impl Leases {
     }
 
     /// Event: `worker`, with `threads` of the farm's `all_threads`, has nothing to do and would
-    /// take up to `most` tiles, under a lease named `epoch`. `None` when no tile is free.
+    /// take up to `most` tiles, under a lease named `id`. `None` when no tile is free.
     pub(crate) fn on_idle(
         &mut self,
         worker: WorkerId,
         (threads, all_threads): (usize, usize),
         most: usize,
-        epoch: Epoch,
+        id: LeaseId,
         now: Instant,
     ) -> Option<Run> {
         let shared_out = self.free.len() * threads / (RUNS_PER_THREAD * all_threads.max(1));
         let count = shared_out.clamp(1, LONGEST_RUN).min(most.max(1));
         let places: BTreeSet<u32> = self.free.iter().copied().take(count).collect();
-        (!places.is_empty()).then(|| self.grant(worker, places, epoch, now))
+        (!places.is_empty()).then(|| self.grant(worker, places, id, now))
     }
 
     /// Event: as [`Leases::on_idle`], and no job has a free tile: `worker` may render one a second
@@ -131,7 +131,7 @@ impl Leases {
     pub(crate) fn on_idle_at_the_end(
         &mut self,
         worker: WorkerId,
-        epoch: Epoch,
+        id: LeaseId,
         now: Instant,
     ) -> Again {
         let slowest = self
@@ -145,28 +145,22 @@ impl Leases {
             .min();
         match slowest {
             Some((is_slow_at, place)) if is_slow_at <= now => {
-                Again::Render(self.grant(worker, BTreeSet::from([place]), epoch, now))
+                Again::Render(self.grant(worker, BTreeSet::from([place]), id, now))
             }
             slowest => Again::Wait(slowest.map(|(is_slow_at, _)| is_slow_at)),
         }
     }
 
-    fn grant(
-        &mut self,
-        worker: WorkerId,
-        places: BTreeSet<u32>,
-        epoch: Epoch,
-        now: Instant,
-    ) -> Run {
+    fn grant(&mut self, worker: WorkerId, places: BTreeSet<u32>, id: LeaseId, now: Instant) -> Run {
         for &place in &places {
             self.free.remove(&place);
             *self.lease_count_mut(place) += 1;
         }
         let tiles = places.iter().map(|&place| self.order[place as usize]).collect();
         let until = now + self.term;
-        self.held.insert(epoch, Lease { worker, tiles: places, until, last_tile: now });
-        self.expiries.insert((until, epoch));
-        Run { epoch, tiles }
+        self.held.insert(id, Lease { worker, tiles: places, until, last_tile: now });
+        self.expiries.insert((until, id));
+        Run { lease: id, tiles }
     }
 
     fn lease_count(&self, place: u32) -> u8 {
@@ -183,13 +177,13 @@ impl Leases {
         }
     }
 
-    /// Event: `worker` goes on rendering under `epoch`. Says whether the lease still is its own.
-    pub(crate) fn on_progress(&mut self, worker: WorkerId, epoch: Epoch, now: Instant) -> bool {
-        match self.held.get_mut(&epoch) {
+    /// Event: `worker` goes on rendering under `id`. Says whether the lease still is its own.
+    pub(crate) fn on_progress(&mut self, worker: WorkerId, id: LeaseId, now: Instant) -> bool {
+        match self.held.get_mut(&id) {
             Some(lease) if lease.worker == worker => {
-                self.expiries.remove(&(lease.until, epoch));
+                self.expiries.remove(&(lease.until, id));
                 lease.until = now + self.term;
-                self.expiries.insert((lease.until, epoch));
+                self.expiries.insert((lease.until, id));
                 true
             }
             _ => false,
@@ -201,12 +195,12 @@ impl Leases {
     pub(crate) fn on_pixels(
         &mut self,
         worker: WorkerId,
-        epoch: Epoch,
+        id: LeaseId,
         tile: TileId,
         hash: PixelHash,
         now: Instant,
     ) -> Verdict {
-        self.on_progress(worker, epoch, now);
+        self.on_progress(worker, id, now);
         let (place, lease_count) = match self.tiles[tile.index()] {
             Tile::Done(first) if first == hash => return Verdict::Duplicate,
             Tile::Done(first) => return Verdict::Differs(first),
@@ -215,13 +209,13 @@ impl Leases {
         self.tiles[tile.index()] = Tile::Done(hash);
         self.free.remove(&place);
         let mut left = lease_count;
-        if let Some(lease) = self.held.get_mut(&epoch) {
+        if let Some(lease) = self.held.get_mut(&id) {
             lease.last_tile = now;
-            left -= u8::from(self.drop_from_lease(place, epoch));
+            left -= u8::from(self.drop_from_lease(place, id));
         }
         if left > 0 {
             // Rendered twice, or under a lease that was lost: seldom enough to look at them all.
-            let others: Vec<Epoch> = self.held.keys().copied().collect();
+            let others: Vec<LeaseId> = self.held.keys().copied().collect();
             for other in others {
                 self.drop_from_lease(place, other);
             }
@@ -230,12 +224,12 @@ impl Leases {
     }
 
     /// Takes a tile that is done out of a lease, which ends with its last tile.
-    fn drop_from_lease(&mut self, place: u32, epoch: Epoch) -> bool {
-        let Some(lease) = self.held.get_mut(&epoch) else { return false };
+    fn drop_from_lease(&mut self, place: u32, id: LeaseId) -> bool {
+        let Some(lease) = self.held.get_mut(&id) else { return false };
         let was_in = lease.tiles.remove(&place);
         if lease.tiles.is_empty() {
-            self.expiries.remove(&(lease.until, epoch));
-            self.held.remove(&epoch);
+            self.expiries.remove(&(lease.until, id));
+            self.held.remove(&id);
         }
         was_in
     }
@@ -243,10 +237,10 @@ impl Leases {
     /// Event: time passes. Leases that ran out are lost and their tiles free again.
     pub(crate) fn on_tick(&mut self, now: Instant) -> Vec<Loss> {
         let mut losses = Vec::new();
-        while let Some(&(until, epoch)) = self.expiries.first()
+        while let Some(&(until, id)) = self.expiries.first()
             && until <= now
         {
-            losses.extend(self.lose(epoch));
+            losses.extend(self.lose(id));
         }
         losses
     }
@@ -254,13 +248,13 @@ impl Leases {
     /// Event: `worker` is gone and will not come back.
     pub(crate) fn on_worker_lost(&mut self, worker: WorkerId) -> Vec<Loss> {
         let lost = self.held.iter().filter(|(_, lease)| lease.worker == worker);
-        let lost: Vec<Epoch> = lost.map(|(&epoch, _)| epoch).collect();
-        lost.into_iter().filter_map(|epoch| self.lose(epoch)).collect()
+        let lost: Vec<LeaseId> = lost.map(|(&id, _)| id).collect();
+        lost.into_iter().filter_map(|id| self.lose(id)).collect()
     }
 
-    fn lose(&mut self, epoch: Epoch) -> Option<Loss> {
-        let lease = self.held.remove(&epoch)?;
-        self.expiries.remove(&(lease.until, epoch));
+    fn lose(&mut self, id: LeaseId) -> Option<Loss> {
+        let lease = self.held.remove(&id)?;
+        self.expiries.remove(&(lease.until, id));
         for &place in &lease.tiles {
             let lease_count = self.lease_count_mut(place);
             *lease_count -= 1;
@@ -269,7 +263,7 @@ impl Leases {
             }
         }
         let tiles = lease.tiles.iter().map(|&place| self.order[place as usize]).collect();
-        Some(Loss { worker: lease.worker, epoch, tiles })
+        Some(Loss { worker: lease.worker, lease: id, tiles })
     }
 }
 
@@ -283,13 +277,13 @@ mod tests {
     const A: WorkerId = WorkerId(1);
     const B: WorkerId = WorkerId(2);
 
-    /// A row of tiles, of which the first worker has leased all under epoch 1.
+    /// A row of tiles, of which the first worker has leased all under lease 1.
     fn all_leased(tile_count: u64) -> (Leases, Vec<TileId>, Instant) {
         let grid = TileGrid::new(Size::new(tile_count * 16, 16).unwrap(), 16).unwrap();
         let mut leases = Leases::new(grid, TERM);
         #[expect(clippy::disallowed_methods, reason = "any instant will do")]
         let start = Instant::now();
-        let run = leases.on_idle(A, (8, 1), 64, Epoch(1), start).unwrap();
+        let run = leases.on_idle(A, (8, 1), 64, LeaseId(1), start).unwrap();
         assert_eq!(run.tiles.len() as u64, tile_count);
         (leases, run.tiles, start)
     }
@@ -297,16 +291,16 @@ mod tests {
     #[test]
     fn a_lease_without_progress_is_lost_and_its_tiles_go_to_others() {
         let (mut leases, tiles, start) = all_leased(5);
-        leases.on_pixels(A, Epoch(1), tiles[0], [0; 32], start);
+        leases.on_pixels(A, LeaseId(1), tiles[0], [0; 32], start);
         assert_eq!(leases.on_tick(start + TERM / 2), []);
-        assert!(leases.on_progress(A, Epoch(1), start + TERM / 2));
+        assert!(leases.on_progress(A, LeaseId(1), start + TERM / 2));
         assert_eq!(leases.on_tick(start + TERM), [], "progress renews it");
 
         let lost = leases.on_tick(start + TERM * 3 / 2);
         let rest = tiles[1..].to_vec();
-        assert_eq!(lost, [Loss { worker: A, epoch: Epoch(1), tiles: rest.clone() }]);
-        assert!(!leases.on_progress(A, Epoch(1), start + TERM * 2));
-        let run = leases.on_idle(B, (8, 1), 64, Epoch(2), start + TERM * 2).unwrap();
+        assert_eq!(lost, [Loss { worker: A, lease: LeaseId(1), tiles: rest.clone() }]);
+        assert!(!leases.on_progress(A, LeaseId(1), start + TERM * 2));
+        let run = leases.on_idle(B, (8, 1), 64, LeaseId(2), start + TERM * 2).unwrap();
         assert_eq!(run.tiles, rest);
     }
 
@@ -314,15 +308,15 @@ mod tests {
     fn late_pixels_of_a_lost_lease_are_the_first_copy() {
         let (mut leases, tiles, start) = all_leased(2);
         leases.on_worker_lost(A);
-        assert_eq!(leases.on_pixels(A, Epoch(1), tiles[0], [7; 32], start), Verdict::Stitch);
-        let run = leases.on_idle(B, (8, 1), 64, Epoch(2), start).unwrap();
+        assert_eq!(leases.on_pixels(A, LeaseId(1), tiles[0], [7; 32], start), Verdict::Stitch);
+        let run = leases.on_idle(B, (8, 1), 64, LeaseId(2), start).unwrap();
         assert_eq!(run.tiles, tiles[1..]);
     }
 
     #[test]
     fn a_second_copy_is_compared_with_the_first() {
         let (mut leases, tiles, start) = all_leased(1);
-        let mut deliver = |hash| leases.on_pixels(A, Epoch(1), tiles[0], [hash; 32], start);
+        let mut deliver = |hash| leases.on_pixels(A, LeaseId(1), tiles[0], [hash; 32], start);
         assert_eq!(deliver(1), Verdict::Stitch);
         assert_eq!(deliver(1), Verdict::Duplicate);
         assert_eq!(deliver(2), Verdict::Differs([1; 32]));
@@ -331,18 +325,18 @@ mod tests {
     #[test]
     fn a_silent_lease_is_rendered_twice_from_its_end_and_once_only() {
         let (mut leases, tiles, start) = all_leased(2);
-        assert_eq!(leases.on_idle(B, (1, 1), 1, Epoch(2), start), None);
+        assert_eq!(leases.on_idle(B, (1, 1), 1, LeaseId(2), start), None);
         let later = start + SLOW;
-        assert_eq!(leases.on_idle_at_the_end(B, Epoch(2), start), Again::Wait(Some(later)));
-        assert_eq!(leases.on_idle_at_the_end(A, Epoch(2), later), Again::Wait(None));
-        for (epoch, &tile) in (2..).zip(tiles.iter().rev()) {
-            let run = Run { epoch: Epoch(epoch), tiles: vec![tile] };
-            assert_eq!(leases.on_idle_at_the_end(B, run.epoch, later), Again::Render(run));
+        assert_eq!(leases.on_idle_at_the_end(B, LeaseId(2), start), Again::Wait(Some(later)));
+        assert_eq!(leases.on_idle_at_the_end(A, LeaseId(2), later), Again::Wait(None));
+        for (id, &tile) in (2..).zip(tiles.iter().rev()) {
+            let run = Run { lease: LeaseId(id), tiles: vec![tile] };
+            assert_eq!(leases.on_idle_at_the_end(B, run.lease, later), Again::Render(run));
         }
-        assert_eq!(leases.on_idle_at_the_end(B, Epoch(9), later), Again::Wait(None));
+        assert_eq!(leases.on_idle_at_the_end(B, LeaseId(9), later), Again::Wait(None));
 
-        for (epoch, &tile) in (2..).zip(tiles.iter().rev()) {
-            leases.on_pixels(B, Epoch(epoch), tile, [0; 32], later);
+        for (id, &tile) in (2..).zip(tiles.iter().rev()) {
+            leases.on_pixels(B, LeaseId(id), tile, [0; 32], later);
         }
         assert!(leases.held.is_empty() && leases.expiries.is_empty(), "nothing is left open");
     }
@@ -353,7 +347,7 @@ mod tests {
         let mut leases = Leases::new(grid, TERM);
         let (_, _, start) = all_leased(1);
         let lengths: Vec<usize> = (0..)
-            .map_while(|epoch| leases.on_idle(A, (1, 4), 1000, Epoch(epoch), start))
+            .map_while(|id| leases.on_idle(A, (1, 4), 1000, LeaseId(id), start))
             .map(|run| run.tiles.len())
             .collect();
         assert!(lengths.is_sorted_by(|a, b| a >= b), "{lengths:?}");

@@ -272,7 +272,7 @@ impl Shared {
                 tiles = %list(&loss.tiles),
                 reason,
                 job = job.0,
-                epoch = loss.epoch.0,
+                lease = loss.lease.0,
                 "lease lost"
             );
         }

@@ -168,7 +168,7 @@ impl Shared {
                     Some(job) => {
                         tracing::debug!(worker = worker.0, ?run, "leased");
                         return Ok(lease_response::Next::Run(wire::Run {
-                            lease: Some(LeaseName { job: job.id, epoch: run.epoch }.into()),
+                            lease: Some(LeaseName { job: job.id, id: run.lease }.into()),
                             tiles: run.tiles.iter().map(|tile| tile.number()).collect(),
                             job: Some(describe(&job, is_local)),
                         }));
