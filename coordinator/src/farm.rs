@@ -7,17 +7,14 @@ use std::{
     time::{Duration, Instant},
 };
 
-use rtfarm_core::{
-    render::Tally,
-    tile::{TileGrid, TileId},
-};
+use rtfarm_core::{render::Tally, tile::TileId};
 use rtfarm_job::{Outcome, Progress};
 use rtfarm_proto::{JobId, LONGEST_WAIT, LeaseId, LeaseName, WorkerId};
 
 use crate::{
     lease::{Leases, Loss, Run},
     members::{Members, NoMember, Process},
-    tiles::{Arrival, PixelHash},
+    tiles::{Arrival, PixelHash, Tiles},
     waiting::{Ask, AskId, Waiting},
 };
 
@@ -409,12 +406,13 @@ impl Farm {
         self.last_job
     }
 
-    /// Event: a picture is ordered, under a number from [`Farm::number_job`].
-    pub(crate) fn on_submit(&mut self, id: JobId, grid: TileGrid, now: Instant) -> Vec<Action> {
-        let progress = Progress { tile_count: grid.count(), ..Progress::default() };
+    /// Event: a picture of these tiles, all of them free, is ordered under a number from
+    /// [`Farm::number_job`].
+    pub(crate) fn on_submit(&mut self, id: JobId, tiles: Tiles, now: Instant) -> Vec<Action> {
+        let progress = Progress { tile_count: tiles.grid().count(), ..Progress::default() };
         let (contributors, storing) = (BTreeSet::new(), BTreeMap::new());
         self.jobs.insert(id, JobState { started: now, progress, contributors, storing });
-        self.leases.on_submit(id, grid);
+        self.leases.on_submit(id, tiles);
         let mut actions = Vec::new();
         if self.phase == Phase::Open {
             self.serve(now, &mut actions);
@@ -526,7 +524,7 @@ impl Farm {
             let tiles = self.leases.tiles(*id);
             assert_eq!(tiles.is_some(), job.progress.outcome.is_none());
             assert_eq!(self.ended.contains(id), job.progress.outcome.is_some());
-            let done = tiles.map_or(job.progress.tiles_done, crate::tiles::Tiles::done_count);
+            let done = tiles.map_or(job.progress.tiles_done, Tiles::done_count);
             assert_eq!(done, job.progress.tiles_done);
             assert!(tiles.is_some() || job.storing.is_empty());
         }
@@ -536,7 +534,7 @@ impl Farm {
 
 #[cfg(test)]
 mod tests {
-    use rtfarm_core::tile::Size;
+    use rtfarm_core::tile::{Size, TileGrid};
 
     use super::*;
 
@@ -572,7 +570,7 @@ mod tests {
         fn submit(&mut self, tile_count: u64) -> (JobId, Vec<Action>) {
             let grid = TileGrid::new(Size::new(tile_count * 16, 16).unwrap(), 16).unwrap();
             let job = self.farm.number_job();
-            let actions = self.farm.on_submit(job, grid, self.now);
+            let actions = self.farm.on_submit(job, Tiles::new(grid), self.now);
             self.farm.check();
             (job, actions)
         }

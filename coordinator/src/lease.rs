@@ -7,7 +7,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use rtfarm_core::tile::{TileGrid, TileId};
+use rtfarm_core::tile::TileId;
 use rtfarm_proto::{JobId, LeaseId, LeaseName, WorkerId};
 
 use crate::tiles::{Arrival, PixelHash, Place, Tiles};
@@ -102,9 +102,9 @@ impl Leases {
         self.last_tiles.iter().map(of)
     }
 
-    /// Event: a job is to be rendered.
-    pub(crate) fn on_submit(&mut self, job: JobId, grid: TileGrid) {
-        self.jobs.insert(job, Tiles::new(grid));
+    /// Event: a job is to be rendered, of which all tiles are free.
+    pub(crate) fn on_submit(&mut self, job: JobId, tiles: Tiles) {
+        self.jobs.insert(job, tiles);
         self.with_free.insert(job);
     }
 
@@ -343,7 +343,7 @@ impl Leases {
 
 #[cfg(test)]
 mod tests {
-    use rtfarm_core::tile::Size;
+    use rtfarm_core::tile::{Size, TileGrid};
 
     use super::*;
 
@@ -360,7 +360,7 @@ mod tests {
     fn job(columns: u64, rows: u64) -> (Leases, Instant) {
         let grid = TileGrid::new(Size::new(columns * 16, rows * 16).unwrap(), 16).unwrap();
         let mut leases = Leases::new(TERM);
-        leases.on_submit(JOB, grid);
+        leases.on_submit(JOB, Tiles::new(grid));
         #[expect(clippy::disallowed_methods, reason = "any instant will do")]
         let start = Instant::now();
         (leases, start)

@@ -2,11 +2,12 @@
 //! bring into pictures.
 //!
 //! `farm` and what it is made of decide: time is an argument there, and nothing waits. `shell` runs
-//! that machine: it hands events to it and does what it answers. `service` translates between gRPC
-//! and the shell, and `run` serves. Each knows only what stands before it:
+//! that machine: it hands events to it and does what it answers, with the files of `store` and what
+//! it keeps of each `job`. `service` translates between gRPC and the shell, and `run` serves. Each
+//! knows only what stands before it:
 //!
 //! ```text
-//! tiles <- lease, members, waiting <- farm <- shell <- service <- run
+//! tiles <- lease, members, waiting <- farm, store, job <- shell <- service <- run
 //! ```
 
 mod farm;

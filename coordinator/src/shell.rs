@@ -25,6 +25,7 @@ use crate::{
     job::Job,
     members::{NoMember, Process},
     store::SceneFile,
+    tiles::Tiles,
     waiting::{Ask, AskId},
 };
 
@@ -312,9 +313,11 @@ impl Shell {
         let progress =
             watch::Sender::new(Progress { tile_count: grid.count(), ..Progress::default() });
         let job = Arc::new(Job { id, scene, settings, grid, picture, progress });
+        // Not under the lock: there may be a million.
+        let tiles = Tiles::new(grid);
         self.tell(|state, now| {
             state.jobs.insert(id, Arc::clone(&job));
-            ((), state.farm.on_submit(id, grid, now))
+            ((), state.farm.on_submit(id, tiles, now))
         });
         Ok(job)
     }

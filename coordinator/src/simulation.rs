@@ -17,6 +17,7 @@ use rtfarm_proto::{JobId, LeaseName, WorkerId};
 use crate::{
     farm::{Action, Delivery, DeliveryId, Farm, Next, Notice, Verdict},
     members::Process,
+    tiles::Tiles,
     waiting::{Ask, AskId},
 };
 
@@ -206,7 +207,7 @@ impl World {
             let grid = TileGrid::new(Size::new(7 * 16, 5 * 16).unwrap(), 16).unwrap();
             let job = self.farm.number_job();
             self.jobs.insert(job);
-            let actions = self.farm.on_submit(job, grid, self.now);
+            let actions = self.farm.on_submit(job, Tiles::new(grid), self.now);
             self.act(actions);
         }
         if self.random.one_in(400) {
