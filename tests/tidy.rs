@@ -93,9 +93,33 @@ fn rendering_in_one_process_knows_no_server() {
 }
 
 #[test]
-fn decisions_about_leases_and_jobs_are_pure() {
-    let files = ["coordinator/src/lease.rs", "coordinator/src/jobs.rs"].map(|f| root().join(f));
-    check_never_names(&files, &["tokio", "tonic", "async ", ".await", "Instant::now"]);
+fn the_machine_of_the_coordinator_is_pure() {
+    let files = ["tiles", "lease", "members", "waiting", "farm"]
+        .map(|file| root().join(format!("coordinator/src/{file}.rs")));
+    check_never_names(&files, &["tokio", "tonic", "async ", ".await", "Instant::now", "tracing"]);
+}
+
+#[test]
+fn no_file_of_the_coordinator_knows_a_later_one() {
+    let order =
+        ["tiles", "lease", "members", "waiting", "farm", "store", "job", "shell", "service", "run"];
+    let others = ["lib", "simulation"];
+    assert_eq!(rust_files("coordinator/src").len(), order.len() + others.len());
+    for (index, file) in order.iter().enumerate() {
+        let path = root().join(format!("coordinator/src/{file}.rs"));
+        let text = fs::read_to_string(&path).unwrap();
+        let code = text.split("#[cfg(test)]").next().unwrap_or_default();
+        // `use crate::{…};` may take several lines.
+        let uses: String =
+            code.split("use crate::").skip(1).filter_map(|rest| rest.split(';').next()).collect();
+        let words = |text: &str| -> Vec<String> {
+            text.split(|c: char| !c.is_alphanumeric() && c != '_').map(str::to_owned).collect()
+        };
+        for later in &order[index..] {
+            assert!(!words(&uses).iter().any(|word| word == later), "{file}.rs knows {later}.rs");
+        }
+        assert_eq!(code.matches("crate::").count(), code.matches("use crate::").count(), "{file}");
+    }
 }
 
 #[test]
