@@ -123,6 +123,15 @@ fn no_file_of_the_coordinator_knows_a_later_one() {
 }
 
 #[test]
+fn decisions_of_workers_and_clients_are_pure() {
+    let files = ["worker/src/call.rs", "worker/src/task.rs", "worker/src/worker.rs"];
+    let files = [&files[..], &["src/submission.rs"]].concat();
+    let files: Vec<PathBuf> = files.iter().map(|file| root().join(file)).collect();
+    let words = ["tokio", "tonic", "async ", ".await", "Instant::now", "std::fs", "std::thread"];
+    check_never_names(&files, &words);
+}
+
+#[test]
 fn the_coordinator_traces_no_rays() {
     check_never_names(&rust_files("coordinator/src"), &["render_tile", "trace("]);
 }

@@ -9,6 +9,7 @@ mod name;
 pub use address::{Address, AddressError};
 pub use convert::{WireError, pixels_from_bytes, pixels_to_bytes, scene_hash, transfer};
 pub use name::{JobId, LeaseId, LeaseName, WorkerId};
+pub use prost::bytes::Bytes;
 
 /// The messages, clients and servers that `proto/generate` writes from `farm.proto`.
 #[expect(
