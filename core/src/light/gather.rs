@@ -151,7 +151,7 @@ impl Gatherer {
                 });
             }
         }
-        let share = seeker.share * material.clearness();
+        let share = seeker.share * material.transmittance();
         if share > 0.0 {
             self.next_rays.push(Ray {
                 origin: position,

@@ -140,7 +140,7 @@ fn relative_density(
         }
     } else {
         // Per solid angle distance² / (area · cosine there), over cosine / π.
-        PI * (distance * distance) / DVec3::from_array(emitter.turned_area).dot(direction).abs()
+        PI * (distance * distance) / DVec3::from_array(emitter.vector_area).dot(direction).abs()
     };
     density / cosine
 }
@@ -253,7 +253,7 @@ pub(crate) fn sphere_share(cosine: f64, sine: f64) -> f64 {
 /// whole sky: its places are chosen by area, and of those next to the receiver that chooses too few.
 fn polygon_promise(view: &View<'_>, emitter: &EmitterRecord, receiver: &Receiver) -> Promise {
     let middle = DVec3::from_array(emitter.middle) - receiver.position;
-    let toward = DVec3::from_array(emitter.turned_area).dot(middle);
+    let toward = DVec3::from_array(emitter.vector_area).dot(middle);
     let radiosity = emitter.radiosity[usize::from(toward > 0.0)];
     let squared = middle.length_squared();
     // The share of the sky that a disc of its area covers at the best angle: 0..=1.

@@ -58,14 +58,14 @@ impl Bounds {
 
 /// What goes into the hierarchy: a box and the number of the face in it.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Leaflet {
+pub(crate) struct BuildPrimitive {
     pub(crate) bounds: Bounds,
     pub(crate) face: u32,
 }
 
-/// A run of leaflets that will be a node or a leaf.
+/// A run of primitives that will be a node or a leaf.
 struct Part<'a> {
-    leaflets: &'a mut [Leaflet],
+    primitives: &'a mut [BuildPrimitive],
     /// The place of the first one in the whole order.
     first: usize,
     bounds: Bounds,
@@ -73,48 +73,48 @@ struct Part<'a> {
     middles: Bounds,
 }
 
-/// Builds the hierarchy over `leaflets` and brings them into the order in which leaves name them.
+/// Builds the hierarchy over `primitives` and brings them into the order in which leaves name them.
 /// The root is node 0; every other node stands after its parent.
-pub(crate) fn build_bvh(leaflets: &mut [Leaflet]) -> Vec<Node> {
-    if leaflets.is_empty() {
+pub(crate) fn build_bvh(primitives: &mut [BuildPrimitive]) -> Vec<Node> {
+    if primitives.is_empty() {
         return vec![Node::EMPTY];
     }
-    build_node(Part::new(leaflets, 0), 0)
+    build_node(Part::new(primitives, 0), 0)
 }
 
 impl<'a> Part<'a> {
-    fn new(leaflets: &'a mut [Leaflet], first: usize) -> Self {
-        let measure = |chunk: &[Leaflet]| {
-            chunk.iter().fold((Bounds::NONE, Bounds::NONE), |(bounds, middles), leaflet| {
-                let middle = [0, 1, 2].map(|axis| leaflet.bounds.middle(axis));
+    fn new(primitives: &'a mut [BuildPrimitive], first: usize) -> Self {
+        let measure = |chunk: &[BuildPrimitive]| {
+            chunk.iter().fold((Bounds::NONE, Bounds::NONE), |(bounds, middles), primitive| {
+                let middle = [0, 1, 2].map(|axis| primitive.bounds.middle(axis));
                 let point = Bounds { min: middle, max: middle };
-                (bounds.join(&leaflet.bounds), middles.join(&point))
+                (bounds.join(&primitive.bounds), middles.join(&point))
             })
         };
-        let (bounds, middles) = if leaflets.len() > 8 * SERIAL {
-            leaflets
+        let (bounds, middles) = if primitives.len() > 8 * SERIAL {
+            primitives
                 .par_chunks(SERIAL)
                 .map(measure)
                 .reduce(|| (Bounds::NONE, Bounds::NONE), |a, b| (a.0.join(&b.0), a.1.join(&b.1)))
         } else {
-            measure(leaflets)
+            measure(primitives)
         };
-        Self { leaflets, first, bounds, middles }
+        Self { primitives, first, bounds, middles }
     }
 
     /// Cuts in two where it is cheapest.
     fn cut(self, level: usize) -> [Self; 2] {
         let cut = if level < MEDIAN_LEVEL { self.cheapest_cut() } else { None };
         let at = match cut {
-            Some(cut) => cut.partition(self.leaflets),
-            None => self.leaflets.len() / 2, // Nothing tells them apart.
+            Some(cut) => cut.partition(self.primitives),
+            None => self.primitives.len() / 2, // Nothing tells them apart.
         };
-        let (left, right) = self.leaflets.split_at_mut(at);
+        let (left, right) = self.primitives.split_at_mut(at);
         [Part::new(left, self.first), Part::new(right, self.first + at)]
     }
 
     fn is_leaf(&self) -> bool {
-        self.leaflets.len() <= LEAF
+        self.primitives.len() <= LEAF
     }
 
     /// The cut between two bins with the least area x count on its sides; `None` where the
@@ -126,13 +126,13 @@ impl<'a> Part<'a> {
             if extent > 0.0 && scale.is_finite() { scale } else { 0.0 }
         });
         let binning = Binning { low: self.middles.min, scale };
-        let bins = if self.leaflets.len() > 8 * SERIAL {
-            self.leaflets
+        let bins = if self.primitives.len() > 8 * SERIAL {
+            self.primitives
                 .par_chunks(SERIAL)
                 .map(|chunk| binning.fill(chunk))
                 .reduce_with(|a, b| merge_bins(&a, &b))?
         } else {
-            binning.fill(self.leaflets)
+            binning.fill(self.primitives)
         };
         let mut best: Option<Cut> = None;
         for axis in (0..3).filter(|&axis| scale[axis] > 0.0) {
@@ -146,7 +146,7 @@ impl<'a> Part<'a> {
             for bin in 1..BINS {
                 side = side.join(&bins[axis][bin - 1]);
                 let cost = side.bounds.half_area() * side.count as f32 + right_cost[bin];
-                let is_cut = side.count > 0 && (side.count as usize) < self.leaflets.len();
+                let is_cut = side.count > 0 && (side.count as usize) < self.primitives.len();
                 if is_cut && best.as_ref().is_none_or(|best| cost < best.cost) {
                     best = Some(Cut { axis, bin, cost, binning });
                 }
@@ -194,12 +194,12 @@ impl Binning {
         (bin as usize).min(BINS - 1)
     }
 
-    fn fill(&self, leaflets: &[Leaflet]) -> [[Bin; BINS]; 3] {
+    fn fill(&self, primitives: &[BuildPrimitive]) -> [[Bin; BINS]; 3] {
         let mut bins = [[Bin::EMPTY; BINS]; 3];
-        for leaflet in leaflets {
+        for primitive in primitives {
             for (axis, bins) in bins.iter_mut().enumerate() {
-                let bin = &mut bins[self.bin(&leaflet.bounds, axis)];
-                bin.bounds = bin.bounds.join(&leaflet.bounds);
+                let bin = &mut bins[self.bin(&primitive.bounds, axis)];
+                bin.bounds = bin.bounds.join(&primitive.bounds);
                 bin.count += 1;
             }
         }
@@ -209,20 +209,21 @@ impl Binning {
 
 impl Cut {
     /// Brings those left of the cut to the front; how many they are.
-    fn partition(&self, leaflets: &mut [Leaflet]) -> usize {
-        let is_left = |leaflet: &Leaflet| self.binning.bin(&leaflet.bounds, self.axis) < self.bin;
-        let (mut left, mut right) = (0, leaflets.len());
+    fn partition(&self, primitives: &mut [BuildPrimitive]) -> usize {
+        let is_left =
+            |primitive: &BuildPrimitive| self.binning.bin(&primitive.bounds, self.axis) < self.bin;
+        let (mut left, mut right) = (0, primitives.len());
         loop {
-            while left < right && is_left(&leaflets[left]) {
+            while left < right && is_left(&primitives[left]) {
                 left += 1;
             }
-            while left < right && !is_left(&leaflets[right - 1]) {
+            while left < right && !is_left(&primitives[right - 1]) {
                 right -= 1;
             }
             if left >= right {
                 return left;
             }
-            leaflets.swap(left, right - 1);
+            primitives.swap(left, right - 1);
         }
     }
 }
@@ -246,10 +247,10 @@ fn build_node(part: Part<'_>, level: usize) -> Vec<Node> {
             node.planes[axis + 3][k] = part.bounds.max[axis];
         }
     }
-    let total: usize = parts.iter().map(|part| part.leaflets.len()).sum();
+    let total: usize = parts.iter().map(|part| part.primitives.len()).sum();
     let build = |part: Part<'_>| {
         if part.is_leaf() {
-            Err(Child::leaf(part.first, part.leaflets.len()))
+            Err(Child::leaf(part.first, part.primitives.len()))
         } else {
             Ok(build_node(part, level + 1))
         }
@@ -264,14 +265,10 @@ fn build_node(part: Part<'_>, level: usize) -> Vec<Node> {
         match child {
             Err(leaf) => nodes[0].children[k] = leaf,
             Ok(subtree) => {
-                let offset = nodes.len() as u32;
-                nodes[0].children[k] = Child(offset);
+                let offset = nodes.len();
+                nodes[0].children[k] = Child::inner(offset);
                 nodes.extend(subtree.into_iter().map(|mut node| {
-                    for child in &mut node.children {
-                        if *child != Child::NONE && !child.is_leaf() {
-                            child.0 += offset;
-                        }
-                    }
+                    node.children = node.children.map(|child| child.moved_by(offset));
                     node
                 }));
             }
@@ -286,12 +283,15 @@ mod tests {
     use crate::{long::tell, prepared::node::MOST_LEVELS};
 
     fn check(boxes: &[([f32; 3], [f32; 3])]) -> Vec<Node> {
-        let mut leaflets: Vec<Leaflet> = boxes
+        let mut primitives: Vec<BuildPrimitive> = boxes
             .iter()
             .enumerate()
-            .map(|(face, &(min, max))| Leaflet { bounds: Bounds { min, max }, face: face as u32 })
+            .map(|(face, &(min, max))| BuildPrimitive {
+                bounds: Bounds { min, max },
+                face: face as u32,
+            })
             .collect();
-        let nodes = build_bvh(&mut leaflets);
+        let nodes = build_bvh(&mut primitives);
         let mut seen = vec![0; boxes.len()];
         let mut levels = vec![1; nodes.len()];
         for (index, node) in nodes.iter().enumerate() {
@@ -305,11 +305,11 @@ mod tests {
                     levels[child.node()] = levels[index] + 1;
                     continue;
                 }
-                for leaflet in &leaflets[child.items()] {
-                    seen[leaflet.face as usize] += 1;
+                for primitive in &primitives[child.items()] {
+                    seen[primitive.face as usize] += 1;
                     for axis in 0..3 {
-                        assert!(node.planes[axis][k] <= leaflet.bounds.min[axis]);
-                        assert!(node.planes[axis + 3][k] >= leaflet.bounds.max[axis]);
+                        assert!(node.planes[axis][k] <= primitive.bounds.min[axis]);
+                        assert!(node.planes[axis + 3][k] >= primitive.bounds.max[axis]);
                     }
                 }
             }
@@ -366,7 +366,7 @@ mod tests {
     fn swept_cut(part: &Part<'_>) -> Option<(usize, usize, f32)> {
         let mut best: Option<(usize, usize, f32)> = None;
         for axis in 0..3 {
-            let mut sorted = part.leaflets.to_vec();
+            let mut sorted = part.primitives.to_vec();
             sorted.sort_by(|a, b| a.bounds.middle(axis).total_cmp(&b.bounds.middle(axis)));
             let mut right_cost = vec![0.0; sorted.len()];
             let mut side = Bounds::NONE;
@@ -391,14 +391,14 @@ mod tests {
     fn cost(part: Part<'_>, cutter: Option<Cutter>, root_area: f64) -> f64 {
         let area = f64::from(part.bounds.half_area()) / root_area;
         if part.is_leaf() {
-            return area * part.leaflets.len() as f64;
+            return area * part.primitives.len() as f64;
         }
         let halves = match cutter.and_then(|cutter| cutter(&part)) {
             None => part.cut(0),
             Some((axis, at, _)) => {
-                let middle = |leaflet: &Leaflet| leaflet.bounds.middle(axis);
-                part.leaflets.sort_by(|a, b| middle(a).total_cmp(&middle(b)));
-                let (left, right) = part.leaflets.split_at_mut(at);
+                let middle = |primitive: &BuildPrimitive| primitive.bounds.middle(axis);
+                part.primitives.sort_by(|a, b| middle(a).total_cmp(&middle(b)));
+                let (left, right) = part.primitives.split_at_mut(at);
                 [Part::new(left, 0), Part::new(right, 0)]
             }
         };
@@ -412,13 +412,13 @@ mod tests {
         let shrunk = |point: [f32; 3]| point.map(|x| x * 1e-6);
         let teapot = scattered(2000).into_iter().map(|(min, max)| (shrunk(min), shrunk(max)));
         boxes.extend(teapot);
-        let leaflets: Vec<Leaflet> = (0..)
+        let primitives: Vec<BuildPrimitive> = (0..)
             .zip(boxes)
-            .map(|(face, (min, max))| Leaflet { bounds: Bounds { min, max }, face })
+            .map(|(face, (min, max))| BuildPrimitive { bounds: Bounds { min, max }, face })
             .collect();
         let cost_of = |cutter| {
-            let mut leaflets = leaflets.clone();
-            let part = Part::new(&mut leaflets, 0);
+            let mut primitives = primitives.clone();
+            let part = Part::new(&mut primitives, 0);
             let area = f64::from(part.bounds.half_area());
             cost(part, cutter, area)
         };

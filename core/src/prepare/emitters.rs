@@ -2,7 +2,7 @@
 
 use glam::{DVec2, DVec3};
 
-use super::emitter_tree::{Twig, build_tree};
+use super::emitter_tree::{EmitterBounds, build_tree};
 use crate::{
     exact::clip::clip,
     prepared::record::{EmitterNode, EmitterRecord, LightRecord, MaterialRecord, NO_NODE},
@@ -17,7 +17,7 @@ pub(crate) struct Emitters<'a> {
     materials: &'a [MaterialRecord],
     lights: &'a [LightRecord],
     ambient: DVec3,
-    found: Vec<(EmitterRecord, Twig)>,
+    found: Vec<(EmitterRecord, EmitterBounds)>,
 }
 
 impl<'a> Emitters<'a> {
@@ -45,14 +45,14 @@ impl<'a> Emitters<'a> {
         }
         let mut vertices: [u32; 4] = std::array::from_fn(|k| vertices[k.min(vertices.len() - 1)]);
         let mut corners = vertices.map(|vertex| DVec3::from_array(all_vertices[vertex as usize]));
-        let turned_area = 0.5 * (corners[2] - corners[0]).cross(corners[3] - corners[1]);
-        let area = turned_area.length();
+        let vector_area = 0.5 * (corners[2] - corners[0]).cross(corners[3] - corners[1]);
+        let area = vector_area.length();
         if area == 0.0 {
             return; // Below what numbers hold: nothing can be aimed at it.
         }
         // The diagonal between the first and the third corner is to be the one inside.
         let [b, c, d] = [1, 2, 3].map(|k| corners[k] - corners[0]);
-        if b.cross(c).dot(turned_area) < 0.0 || c.cross(d).dot(turned_area) < 0.0 {
+        if b.cross(c).dot(vector_area) < 0.0 || c.cross(d).dot(vector_area) < 0.0 {
             vertices.rotate_left(1);
             corners.rotate_left(1);
         }
@@ -64,7 +64,7 @@ impl<'a> Emitters<'a> {
             let position = DVec3::from_array(light.position);
             for &corner in outline {
                 let to_light = position - (middle + 0.8 * (corner - middle));
-                let height = turned_area.dot(to_light) / area;
+                let height = vector_area.dot(to_light) / area;
                 let distance = to_light.length();
                 if distance > 0.0 {
                     let share = height.abs() / (distance * distance * distance);
@@ -77,7 +77,7 @@ impl<'a> Emitters<'a> {
         let radius = outline.iter().map(reach).fold(0.0, f64::max);
         let record = EmitterRecord {
             middle: middle.to_array(),
-            turned_area: turned_area.to_array(),
+            vector_area: vector_area.to_array(),
             size: area,
             radiosity: received.map(|light| self.radiosity(material, light)),
             vertices,
@@ -86,7 +86,7 @@ impl<'a> Emitters<'a> {
             node: NO_NODE,
             by_size: 0,
         };
-        self.found.push((record, Twig { center: middle, radius, area }));
+        self.found.push((record, EmitterBounds { center: middle, radius, area }));
     }
 
     /// A sphere: only its outside is aimed at.
@@ -116,7 +116,7 @@ impl<'a> Emitters<'a> {
         }
         let record = EmitterRecord {
             middle: center.to_array(),
-            turned_area: [0.0; 3],
+            vector_area: [0.0; 3],
             size: radius,
             radiosity: [self.radiosity(material, received); 2],
             vertices: [0; 4],
@@ -126,19 +126,19 @@ impl<'a> Emitters<'a> {
             by_size: 0,
         };
         let area = 4.0 * std::f64::consts::PI * (radius * radius);
-        self.found.push((record, Twig { center, radius, area }));
+        self.found.push((record, EmitterBounds { center, radius, area }));
     }
 
     /// All, by their ranks, and the tree over them.
     pub(crate) fn finish(mut self) -> (Vec<EmitterRecord>, Vec<EmitterNode>) {
         self.found.sort_unstable_by_key(|(record, _)| record.rank);
-        let (mut emitters, twigs): (Vec<_>, Vec<_>) = self.found.into_iter().unzip();
+        let (mut emitters, bounds): (Vec<_>, Vec<_>) = self.found.into_iter().unzip();
         let mut by_size: Vec<u32> = (0..emitters.len() as u32).collect();
-        by_size.sort_by(|&a, &b| twigs[b as usize].area.total_cmp(&twigs[a as usize].area));
+        by_size.sort_by(|&a, &b| bounds[b as usize].area.total_cmp(&bounds[a as usize].area));
         for (emitter, by_size) in emitters.iter_mut().zip(by_size) {
             emitter.by_size = by_size;
         }
-        let nodes = build_tree(&mut emitters, &twigs);
+        let nodes = build_tree(&mut emitters, &bounds);
         (emitters, nodes)
     }
 

@@ -11,9 +11,9 @@ use std::collections::HashMap;
 
 use rayon::prelude::*;
 
-use self::bvh::{Bounds, Leaflet};
+use self::bvh::{Bounds, BuildPrimitive};
 use self::emitters::{Emitters, smaller_ball, within};
-use self::mip_maps::Pyramids;
+use self::mip_maps::MipMaps;
 use self::weld::weld;
 
 use glam::{DVec2, DVec3};
@@ -29,10 +29,10 @@ use crate::{
         layout::Sections,
         node::{Child, Frame},
         record::{
-            Camera, CoplanarRecord, DIFFERENCE, EmitterNode, EmitterRecord, Features, INTERSECTION,
-            Item, Kind, LEAF, LeafRecord, LightRecord, Lighting, MaterialRecord, NO_NODE,
-            NodeRecord, PlaneIndex, PlaneRecord, QuadrangleRecord, SolidRecord, SphereRecord,
-            Surface, Texcoords, TexturedFace, TriangleRecord, UNION,
+            Camera, CoplanarRecord, EmitterNode, EmitterRecord, Features, Item, Kind, LeafRecord,
+            LightRecord, Lighting, MaterialRecord, NO_NODE, PlaneIndex, PlaneRecord,
+            QuadrangleRecord, SolidNodeKind, SolidNodeRecord, SolidRecord, SphereRecord, Surface,
+            Texcoords, TexturedFace, TriangleRecord,
         },
     },
     scene::{self, Material, Mesh, MeshVertices, Operation, Parallelepiped, Scene, SolidNode},
@@ -78,12 +78,12 @@ fn prepare_gathering(scene: &Scene, gathering: u32) -> Result<PreparedBytes, Pre
     faces.find_planes();
     faces.find_equal_spheres();
     let frame = faces.frame();
-    let mut leaflets = faces.leaflets(&frame);
-    let nodes = bvh::build_bvh(&mut leaflets);
-    let mut sorted = faces.sort(&leaflets);
+    let mut primitives = faces.primitives(&frame);
+    let nodes = bvh::build_bvh(&mut primitives);
+    let mut sorted = faces.sort(&primitives);
 
     let mut lights = Vec::with_capacity(scene.lights.len());
-    let mut touches = Vec::new();
+    let mut coincident = Vec::new();
     for (k, light) in scene.lights.iter().enumerate() {
         let position = light.position * scale;
         let intensity = light.intensity * scale * scale;
@@ -91,9 +91,9 @@ fn prepare_gathering(scene: &Scene, gathering: u32) -> Result<PreparedBytes, Pre
             return Err(PrepareError::Light(k + 1));
         }
         let surfaces = sorted.surfaces_at(position);
-        let (first, count) = (touches.len() as u32, surfaces.len() as u32);
-        lights.push(LightRecord::new(position, intensity, first, count));
-        touches.extend(surfaces);
+        let run = coincident.len()..coincident.len() + surfaces.len();
+        lights.push(LightRecord::new(position, intensity, run));
+        coincident.extend(surfaces);
     }
     let images = Images::gather(scene, &ranks);
     let materials: Vec<MaterialRecord> = (scene.materials.iter().zip(&images.of_materials))
@@ -130,7 +130,7 @@ fn prepare_gathering(scene: &Scene, gathering: u32) -> Result<PreparedBytes, Pre
         planes: sorted.planes,
         materials: &materials,
         lights: &lights,
-        touches: &touches,
+        coincident: &coincident,
         solids: &sorted.solids,
         solid_nodes: sorted.solid_nodes,
         leaves: sorted.leaves,
@@ -138,18 +138,18 @@ fn prepare_gathering(scene: &Scene, gathering: u32) -> Result<PreparedBytes, Pre
         emitters: &emitters,
         emitter_nodes: &emitter_nodes,
         textured_faces: &images.faces,
-        textures: &images.pyramids.textures,
-        texture_levels: &images.pyramids.levels,
-        fine_texels: &images.pyramids.fine,
-        coarse_texels: &images.pyramids.coarse,
+        textures: &images.mip_maps.textures,
+        texture_levels: &images.mip_maps.levels,
+        fine_texels: &images.mip_maps.fine,
+        coarse_texels: &images.mip_maps.coarse,
     };
     Ok(assemble(camera, lighting, frame, scale, features, &sections))
 }
 
 /// The images that faces show, and the texture coordinates of those faces by ascending rank.
 struct Images {
-    pyramids: Pyramids,
-    /// Of each material, the image in `pyramids` or [`MaterialRecord::PLAIN`].
+    mip_maps: MipMaps,
+    /// Of each material, the image in `mip_maps` or [`MaterialRecord::PLAIN`].
     of_materials: Vec<u32>,
     faces: Vec<TexturedFace>,
 }
@@ -183,18 +183,18 @@ impl Images {
         }
         faces.par_sort_unstable_by_key(|face| face.rank);
 
-        let mut pyramids = Pyramids { transfer: scene.transfer, ..Pyramids::default() };
+        let mut mip_maps = MipMaps { transfer: scene.transfer, ..MipMaps::default() };
         let mut numbers = vec![None; scene.textures.len()];
         let of_materials = (scene.materials.iter().zip(is_worn))
             .map(|(material, is_worn)| match material.texture {
                 Some(texture) if is_worn => *numbers[texture as usize].get_or_insert_with(|| {
-                    pyramids.add(&scene.textures[texture as usize]);
-                    pyramids.textures.len() as u32 - 1
+                    mip_maps.add(&scene.textures[texture as usize]);
+                    mip_maps.textures.len() as u32 - 1
                 }),
                 _ => MaterialRecord::PLAIN,
             })
             .collect();
-        Self { pyramids, of_materials, faces }
+        Self { mip_maps, of_materials, faces }
     }
 }
 
@@ -316,7 +316,7 @@ struct Faces {
     spheres: Vec<SphereRecord>,
     solids: Vec<SolidRecord>,
     solid_bounds: Vec<(DVec3, DVec3)>,
-    solid_nodes: Vec<NodeRecord>,
+    solid_nodes: Vec<SolidNodeRecord>,
     leaves: Vec<LeafRecord>,
     /// For each leaf that is a parallelepiped, its number among the leaves and its rank.
     boxes: Vec<(usize, u32)>,
@@ -341,7 +341,7 @@ struct Sorted<'a> {
     spheres: Vec<SphereRecord>,
     planes: &'a [PlaneRecord],
     solids: Vec<SolidRecord>,
-    solid_nodes: &'a [NodeRecord],
+    solid_nodes: &'a [SolidNodeRecord],
     leaves: &'a [LeafRecord],
 }
 
@@ -407,8 +407,8 @@ impl Faces {
         let mut waiting: Vec<(u32, (DVec3, DVec3))> = Vec::new();
         for (index, node) in (0..).zip(&solid.nodes) {
             let number = (self.leaves.len() - first_leaf) as u32;
-            let mut record = NodeRecord {
-                operation: LEAF,
+            let mut record = SolidNodeRecord {
+                kind: SolidNodeKind::LEAF,
                 parent: NO_NODE,
                 first_child: number,
                 next: NO_NODE,
@@ -435,10 +435,10 @@ impl Faces {
                 }
                 SolidNode::Operation { operation, operands } => {
                     let operands = waiting.split_off(waiting.len() - *operands as usize);
-                    record.operation = match operation {
-                        Operation::Union => UNION,
-                        Operation::Intersection => INTERSECTION,
-                        Operation::Difference => DIFFERENCE,
+                    record.kind = match operation {
+                        Operation::Union => SolidNodeKind::UNION,
+                        Operation::Intersection => SolidNodeKind::INTERSECTION,
+                        Operation::Difference => SolidNodeKind::DIFFERENCE,
                     };
                     record.operands = operands.len() as u32;
                     record.first_child = operands[0].0;
@@ -478,14 +478,15 @@ impl Faces {
         let nodes = &self.solid_nodes[first_node..];
         let mut is_turned = vec![false; nodes.len()];
         for index in (0..nodes.len()).rev() {
-            let NodeRecord { parent, is_first, .. } = nodes[index];
+            let SolidNodeRecord { parent, is_first, .. } = nodes[index];
             if parent != NO_NODE {
-                let is_taken = nodes[parent as usize].operation == DIFFERENCE && is_first == 0;
+                let is_taken =
+                    nodes[parent as usize].kind == SolidNodeKind::DIFFERENCE && is_first == 0;
                 is_turned[index] = is_turned[parent as usize] ^ is_taken;
             }
         }
         for leaf in &mut self.leaves[first_leaf..] {
-            leaf.is_turned = u32::from(is_turned[leaf.node as usize]);
+            leaf.is_reversed = u32::from(is_turned[leaf.node as usize]);
         }
     }
 
@@ -684,7 +685,7 @@ impl Faces {
         Frame { origin: origin.to_array(), scale: power_of_two_below_inverse(extent) }
     }
 
-    fn leaflets(&self, frame: &Frame) -> Vec<Leaflet> {
+    fn primitives(&self, frame: &Frame) -> Vec<BuildPrimitive> {
         let origin = DVec3::from_array(frame.origin);
         let bounds = |(min, max): (DVec3, DVec3)| {
             // Rounding to f64 must not pull a box in.
@@ -694,21 +695,22 @@ impl Faces {
                 max: relative(max).map(|x| above(x + x.abs() * f64::EPSILON)),
             }
         };
-        let mut leaflets: Vec<Leaflet> = (0..self.flat_count())
+        let mut primitives: Vec<BuildPrimitive> = (0..self.flat_count())
             .into_par_iter()
-            .map(|face| Leaflet {
+            .map(|face| BuildPrimitive {
                 bounds: bounds(bounds_of(self.corners(face))),
                 face: face as u32,
             })
             .collect();
         let round = self.round_bounds().zip(self.flat_count() as u32..);
-        leaflets.extend(round.map(|(round, face)| Leaflet { bounds: bounds(round), face }));
-        leaflets
+        primitives
+            .extend(round.map(|(round, face)| BuildPrimitive { bounds: bounds(round), face }));
+        primitives
     }
 
-    fn sort(&self, leaflets: &[Leaflet]) -> Sorted<'_> {
+    fn sort(&self, primitives: &[BuildPrimitive]) -> Sorted<'_> {
         let mut sorted = Sorted {
-            items: Vec::with_capacity(leaflets.len()),
+            items: Vec::with_capacity(primitives.len()),
             vertices: Vec::new(),
             triangles: Vec::new(),
             coplanars: Vec::new(),
@@ -721,8 +723,8 @@ impl Faces {
         };
         // Vertices are numbered in the order in which leaves come to them.
         let mut numbers = vec![u32::MAX; self.corners.len()];
-        for leaflet in leaflets {
-            let face = leaflet.face as usize;
+        for primitive in primitives {
+            let face = primitive.face as usize;
             if let Some(round) = face.checked_sub(self.flat_count()) {
                 if let Some(&sphere) = self.spheres.get(round) {
                     sorted.items.push(Item::new(Kind::Sphere, sorted.spheres.len()));

@@ -4,8 +4,8 @@ use super::{
     layout::View,
     node::{Child, MOST_LEVELS, Node},
     record::{
-        EmitterNode, EmitterRecord, Kind, LEAF, LeafRecord, MaterialRecord, NO_NODE, NodeRecord,
-        PlaneIndex, TexturedFace,
+        EmitterNode, EmitterRecord, Kind, LeafRecord, MaterialRecord, NO_NODE, PlaneIndex,
+        SolidNodeKind, SolidNodeRecord, TexturedFace,
     },
 };
 
@@ -105,8 +105,8 @@ pub(super) fn check(view: &View<'_>) -> Result<(), &'static str> {
     for light in view.lights {
         let is_finite = light.intensity.iter().all(|channel| channel.is_finite());
         ensure(finite(&light.position) && is_finite, "a light")?;
-        let end = light.touches_first as usize + light.touches_count as usize;
-        ensure(end <= view.touches.len(), "a light")?;
+        let end = light.coincident_first as usize + light.coincident_count as usize;
+        ensure(end <= view.coincident.len(), "a light")?;
     }
     check_textures(view)?;
     check_emitters(view)
@@ -139,7 +139,7 @@ fn check_emitters(view: &View<'_>) -> Result<(), &'static str> {
         emitter.vertices.iter().all(|&k| (k as usize) < view.vertices.len()) || emitter.is_sphere()
     };
     for emitter in view.emitters {
-        let is_place = finite(&emitter.middle) && finite(&emitter.turned_area);
+        let is_place = finite(&emitter.middle) && finite(&emitter.vector_area);
         let is_shape = is_place && finite(&[emitter.size]) && emitter.size > 0.0;
         let is_known = emitter.shape <= EmitterRecord::SPHERE && vertices(emitter);
         ensure((emitter.by_size as usize) < view.emitters.len(), "an emitter")?;
@@ -156,19 +156,19 @@ fn check_emitters(view: &View<'_>) -> Result<(), &'static str> {
 }
 
 /// Whether nodes are a tree over these leaves in postfix order, so that walking it ends.
-fn check_solid_tree(nodes: &[NodeRecord], leaves: &[LeafRecord]) -> Result<(), ()> {
+fn check_solid_tree(nodes: &[SolidNodeRecord], leaves: &[LeafRecord]) -> Result<(), ()> {
     let ensure = |holds: bool| if holds { Ok(()) } else { Err(()) };
     ensure(nodes.last().is_some_and(|root| root.parent == NO_NODE))?;
     let mut owners = vec![NO_NODE; nodes.len()];
     let mut is_taken = vec![false; leaves.len()];
     for (index, node) in (0..).zip(nodes) {
-        if node.operation == LEAF {
+        if node.kind == SolidNodeKind::LEAF {
             let leaf = leaves.get(node.first_child as usize).ok_or(())?;
             let is_free = !std::mem::replace(&mut is_taken[node.first_child as usize], true);
             ensure(is_free && leaf.node == index)?;
             continue;
         }
-        ensure(node.operation < LEAF && node.operands >= 2)?;
+        ensure(node.kind.is_operation() && node.operands >= 2)?;
         let mut child = node.first_child;
         for operand in 0..node.operands {
             ensure(child < index && owners[child as usize] == NO_NODE)?;

@@ -287,7 +287,7 @@ impl<'a> Beams<'a> {
         self.outlines.clear();
         self.corners.clear();
         self.waiting.clear();
-        self.waiting.push(Child(0)); // The root.
+        self.waiting.push(Child::ROOT);
         let view = self.view;
         let sides = self.sides(block, deepest);
         while let Some(child) = self.waiting.pop() {
@@ -359,7 +359,7 @@ impl<'a> Beams<'a> {
                 let solid = &view.solids[item.index()];
                 for (number, leaf) in (0..).zip(view.solid_leaves(solid)) {
                     // What is taken away is seen where something is left.
-                    if leaf.is_turned == 0 {
+                    if leaf.is_reversed == 0 {
                         self.gather_leaf(item, number, leaf, block, deepest);
                     }
                 }
@@ -766,7 +766,7 @@ struct Shares {
 fn shares(material: &MaterialRecord) -> Shares {
     let own = (1.0 - material.reflect) * material.alpha;
     let bends = material.refract != 0.0 && material.refract != 1.0;
-    let straight = if bends { 0.0 } else { material.clearness() };
+    let straight = if bends { 0.0 } else { material.transmittance() };
     // Exactly 0 where nothing is mirrored or bent.
     let other = if bends { 1.0 - own } else { material.reflect };
     debug_assert!((own + other + straight - 1.0).abs() < 1e-9);
