@@ -1,6 +1,5 @@
-//! Light that faces send on: how much sooner a picture is as good when rays are aimed at emitters
-//! and sent where they count, against one ray from every place over its whole sky by the same
-//! kernel; and how far off single pixels are.
+//! Light that faces send on: how much sooner a picture is as good when rays are aimed at emitters,
+//! against rays over the whole sky alone by the same kernel; and how far off single pixels are.
 //!
 //!     cargo bench -p rtfarm-core --bench secondary
 //!
@@ -15,7 +14,7 @@ use std::{env, fs, ops::ControlFlow, path::Path, time::Instant};
 
 use rtfarm_core::{
     isa::Isa,
-    prepare::{prepare, prepare_unaimed},
+    prepare::{prepare, prepare_with},
     prepared::{PreparedBytes, PreparedScene},
     read::read_scene,
     render::{Quality, RenderedTile, Sampling, Settings, render_tile},
@@ -54,7 +53,7 @@ fn ways(name: &str) -> [(&'static str, Block); 2] {
     let scene = read_scene(&text, &nothing).scene.expect("a scene without a fault");
     let open = |bytes| PreparedScene::open(bytes).expect("a valid block");
     [
-        ("spread", open(prepare_unaimed(&scene).expect("a scene"))),
+        ("spread", open(prepare_with(&scene, false).expect("a scene"))),
         ("aimed", open(prepare(&scene).expect("a scene"))),
     ]
 }

@@ -5,7 +5,7 @@
 use super::sampling::{self, Aim, Receiver};
 use crate::{
     isa::Isa,
-    prepared::{layout::View, record::Features},
+    prepared::layout::View,
     sample::Sample,
     shade::{
         point::{Point, surface_color},
@@ -26,10 +26,7 @@ const MOST_CROSSINGS: u32 = 1 << 12;
 const FULL_WEIGHT: f64 = 0.25;
 
 /// The probability with which a place of this weight sends a ray: above 0.
-fn sending_chance(view: &View<'_>, weight: f64) -> f64 {
-    if view.header.features.has_emitters == Features::UNAIMED {
-        return 1.0;
-    }
+fn sending_chance(weight: f64) -> f64 {
     (weight * (1.0 / FULL_WEIGHT)).clamp(f64::MIN_POSITIVE, 1.0)
 }
 
@@ -73,7 +70,7 @@ impl Gatherer {
         self.seekers.clear();
         for (k, point) in points.iter().enumerate() {
             let numbers = samples[point.sample].gather_numbers(point.node);
-            let chance = sending_chance(view, point.weight);
+            let chance = sending_chance(point.weight);
             if chance < 1.0 && numbers.sending() >= chance {
                 continue;
             }

@@ -10,10 +10,7 @@ use glam::DVec3;
 
 use super::tree::Survey;
 use crate::{
-    prepared::{
-        layout::View,
-        record::{EmitterRecord, Features},
-    },
+    prepared::{layout::View, record::EmitterRecord},
     sample::GatherNumbers,
 };
 
@@ -78,7 +75,8 @@ fn sky_probability(promise: &Promise) -> f64 {
 /// (1995): the balance heuristic, here for the light of each emitter on its own, so that only the
 /// chosen one's density must be known.
 pub(crate) fn aim(view: &View<'_>, receiver: &Receiver, numbers: &GatherNumbers) -> Option<Aim> {
-    if view.header.features.has_emitters == Features::UNAIMED {
+    // Nothing on record can be aimed at.
+    if view.emitters.is_empty() {
         return toward_sky(receiver, 1.0, numbers.direction());
     }
     let survey = Survey::new(view, receiver);

@@ -56,17 +56,16 @@ pub enum PrepareError {
 /// Turns a scene into a prepared scene, on rayon's threads; the same scene gives the same bytes on
 /// any number of them.
 pub fn prepare(scene: &Scene) -> Result<PreparedBytes, PrepareError> {
-    prepare_gathering(scene, Features::AIMED)
+    prepare_with(scene, true)
 }
 
-/// The same, but light that faces send on is looked for all over the sky alone: the noisier way
-/// that benchmarks compare with.
+/// The same. Without records of the emitters, light that faces send on is looked for over the
+/// whole hemisphere alone: the noisier way that benchmarks compare with.
 #[doc(hidden)]
-pub fn prepare_unaimed(scene: &Scene) -> Result<PreparedBytes, PrepareError> {
-    prepare_gathering(scene, Features::UNAIMED)
-}
-
-fn prepare_gathering(scene: &Scene, gathering: u32) -> Result<PreparedBytes, PrepareError> {
+pub fn prepare_with(
+    scene: &Scene,
+    keeps_emitter_records: bool,
+) -> Result<PreparedBytes, PrepareError> {
     let viewport = scene.viewport.ok_or(PrepareError::NoViewport)?;
     let ranks = Ranks::new(scene);
     if ranks.count > Child::ITEM_LIMIT as u64 {
@@ -117,7 +116,10 @@ fn prepare_gathering(scene: &Scene, gathering: u32) -> Result<PreparedBytes, Pre
     if features.is_lit == 1 && materials.iter().any(MaterialRecord::emits) {
         let found = Emitters::new(&materials, &lights, DVec3::from_array(lighting.ambient));
         (emitters, emitter_nodes) = faces.find_emitters(found, &mut sorted);
-        features.has_emitters = if emitters.is_empty() { 0 } else { gathering };
+        features.has_emitters = u32::from(!emitters.is_empty());
+        if !keeps_emitter_records {
+            (emitters, emitter_nodes) = (Vec::new(), Vec::new());
+        }
     }
     let sections = Sections {
         nodes: &nodes,

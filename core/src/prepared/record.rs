@@ -18,7 +18,7 @@ pub(crate) struct Features {
     pub(crate) has_clear_shadows: u32,
     /// There are constructive solids.
     pub(crate) has_solids: u32,
-    /// Faces send light on to others: [`Features::AIMED`] or [`Features::UNAIMED`].
+    /// Faces send light on to others.
     pub(crate) has_emitters: u32,
     /// A face shows an image.
     pub(crate) has_textures: u32,
@@ -28,11 +28,6 @@ pub(crate) struct Features {
 }
 
 impl Features {
-    /// Light is looked for where emitters are, as well as all over the sky.
-    pub(crate) const AIMED: u32 = 1;
-    /// Only all over the sky, by one ray from each place: the yardstick.
-    pub(crate) const UNAIMED: u32 = 2;
-
     pub(crate) fn has_branches(&self) -> bool {
         self.has_branches == 1
     }
@@ -42,7 +37,7 @@ impl Features {
     }
 
     pub(crate) fn has_emitters(&self) -> bool {
-        self.has_emitters != 0 && !left_out::SECONDARY_LIGHT
+        self.has_emitters == 1 && !left_out::SECONDARY_LIGHT
     }
 
     pub(crate) fn has_textures(&self) -> bool {
