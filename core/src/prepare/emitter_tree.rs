@@ -4,17 +4,17 @@ use glam::DVec3;
 
 use crate::prepared::record::{EmitterNode, EmitterRecord, NO_NODE};
 
-/// What the tree is made of: an emitter's bounding ball, its area and what it sends on.
+/// The sphere around an emitter, and its area.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct EmitterBounds {
-    pub(crate) center: DVec3,
-    pub(crate) radius: f64,
-    pub(crate) area: f64,
+pub(super) struct EmitterBounds {
+    pub(super) center: DVec3,
+    pub(super) radius: f64,
+    pub(super) area: f64,
 }
 
 /// Builds the tree over `emitters`, of which `bounds` tells more, and enters their nodes in them.
 /// The root is node 0, two children stand side by side after their parent.
-pub(crate) fn build_tree(
+pub(super) fn build_emitter_tree(
     emitters: &mut [EmitterRecord],
     bounds: &[EmitterBounds],
 ) -> Vec<EmitterNode> {

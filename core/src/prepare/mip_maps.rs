@@ -13,13 +13,13 @@ use crate::{
 /// Images with all their levels, `[y][x]` each.
 #[derive(Debug, Default)]
 pub(crate) struct MipMaps {
-    /// Of the images' texels.
+    /// The images' texels become light by this.
     pub(crate) transfer: Transfer,
     pub(crate) textures: Vec<TextureRecord>,
     pub(crate) levels: Vec<LevelRecord>,
-    /// Of the images themselves: red, green, blue as their files have them, and 0.
+    /// The texels of the images themselves: red, green, blue as their files have them, and 0.
     pub(crate) fine: Vec<[u8; 4]>,
-    /// Of all other levels: red, green, blue light.
+    /// The texels of all other levels: red, green, blue light.
     pub(crate) coarse: Vec<[f32; 3]>,
 }
 
@@ -67,8 +67,8 @@ fn half_size(width: u32, height: u32, at: impl Fn(u32, u32) -> [f64; 3] + Sync) 
     texels.par_chunks_mut(columns as usize).zip(0..rows).for_each(|(row, y)| {
         for (texel, x) in row.iter_mut().zip(0..columns) {
             let mut sum = [0.0; 3];
-            for (y, down) in parts(y, height, rows) {
-                for (x, across) in parts(x, width, columns) {
+            for (y, down) in overlaps(y, height, rows) {
+                for (x, across) in overlaps(x, width, columns) {
                     for (sum, channel) in sum.iter_mut().zip(at(x, y)) {
                         *sum += down * across * channel;
                     }
@@ -82,7 +82,7 @@ fn half_size(width: u32, height: u32, at: impl Fn(u32, u32) -> [f64; 3] + Sync) 
 
 /// Which of `fine` parts of a line the `index`th of `coarse` parts covers, and how much of each, in
 /// units of 1 / `coarse` part: whole numbers whose sum is `fine`.
-fn parts(index: u32, fine: u32, coarse: u32) -> impl Iterator<Item = (u32, f64)> {
+fn overlaps(index: u32, fine: u32, coarse: u32) -> impl Iterator<Item = (u32, f64)> {
     let [index, fine, coarse] = [index, fine, coarse].map(u64::from);
     let (start, end) = (index * fine, (index + 1) * fine);
     (start / coarse..end.div_ceil(coarse)).map(move |part| {

@@ -1,4 +1,4 @@
-//! What readers of a prepared scene rely on, checked once when it is opened.
+//! The check of a prepared scene when it is opened: all that its readers rely on, once.
 
 use super::{
     layout::View,
@@ -9,7 +9,7 @@ use super::{
     },
 };
 
-/// Everything that readers rely on.
+/// Checks everything that readers rely on; the error names what is wrong.
 pub(super) fn check(view: &View<'_>) -> Result<(), &'static str> {
     let ensure = |holds: bool, what: &'static str| if holds { Ok(()) } else { Err(what) };
     let finite = |numbers: &[f64]| numbers.iter().all(|x| x.is_finite() && x.abs() < 1e100);
@@ -112,7 +112,7 @@ pub(super) fn check(view: &View<'_>) -> Result<(), &'static str> {
     check_emitters(view)
 }
 
-/// What those rely on who look at textures.
+/// Checks what readers of textures rely on.
 fn check_textures(view: &View<'_>) -> Result<(), &'static str> {
     let ensure = |holds: bool, what: &'static str| if holds { Ok(()) } else { Err(what) };
     let finite = |numbers: &[f64]| numbers.iter().all(|x| x.is_finite() && x.abs() < 1e100);
@@ -131,7 +131,7 @@ fn check_textures(view: &View<'_>) -> Result<(), &'static str> {
     ensure(texels.iter().all(|channel| (0.0..=1.0).contains(channel)), "a texel")
 }
 
-/// What those rely on who aim at emitters.
+/// Checks what those rely on who aim at emitters.
 fn check_emitters(view: &View<'_>) -> Result<(), &'static str> {
     let ensure = |holds: bool, what: &'static str| if holds { Ok(()) } else { Err(what) };
     let finite = |numbers: &[f64]| numbers.iter().all(|x| x.is_finite() && x.abs() < 1e100);
@@ -155,7 +155,7 @@ fn check_emitters(view: &View<'_>) -> Result<(), &'static str> {
     check_emitter_tree(view.emitter_nodes, view.emitters).map_err(|()| "the tree of emitters")
 }
 
-/// Whether nodes are a tree over these leaves in postfix order, so that walking it ends.
+/// Checks that nodes are a tree over these leaves in postfix order, so that walking it ends.
 fn check_solid_tree(nodes: &[SolidNodeRecord], leaves: &[LeafRecord]) -> Result<(), ()> {
     let ensure = |holds: bool| if holds { Ok(()) } else { Err(()) };
     ensure(nodes.last().is_some_and(|root| root.parent == NO_NODE))?;
@@ -182,7 +182,7 @@ fn check_solid_tree(nodes: &[SolidNodeRecord], leaves: &[LeafRecord]) -> Result<
     ensure(nodes.iter().zip(&owners).all(|(node, &owner)| node.parent == owner))
 }
 
-/// Whether nodes are such a tree over the emitters: every walk up or down ends.
+/// Checks that nodes are a tree over the emitters, parents first: every walk up or down ends.
 fn check_emitter_tree(nodes: &[EmitterNode], emitters: &[EmitterRecord]) -> Result<(), ()> {
     let ensure = |holds: bool| if holds { Ok(()) } else { Err(()) };
     ensure(nodes.len() == (2 * emitters.len()).saturating_sub(1))?;

@@ -305,15 +305,6 @@ pub(crate) struct LeafRecord {
 }
 
 impl LeafRecord {
-    pub(crate) fn sphere(center: DVec3, radius: f64, material: u32, node: u32) -> Self {
-        Self { center: center.to_array(), radius, ..Self::parallelepiped(material, node) }
-    }
-
-    pub(crate) fn parallelepiped(material: u32, node: u32) -> Self {
-        let planes = [PlaneIndex(0); 6];
-        Self { center: [0.0; 3], radius: 0.0, planes, material, node, is_reversed: 0, surface: 0 }
-    }
-
     #[inline(always)]
     pub(crate) fn is_sphere(&self) -> bool {
         self.radius > 0.0
