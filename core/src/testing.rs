@@ -2,6 +2,6 @@
 
 pub use crate::{
     left_out::{BUILT_WITHOUT, FEATURES},
-    prepare::prepare_unaimed,
+    prepare::prepare_with,
     trace::probe::{FaceTests, Probe, ProbeHit, Probing},
 };

@@ -5,3 +5,4 @@ pub(crate) mod float;
 pub(crate) mod hash;
 pub(crate) mod polygon;
 pub(crate) mod predicates;
+pub(crate) mod welding;

@@ -8,7 +8,7 @@ use super::{
 };
 use crate::{
     isa::Isa,
-    prepared::{layout::View, record::Features},
+    prepared::layout::View,
     sample::Sample,
     shade::{
         point::{Interaction, Point},
@@ -33,10 +33,7 @@ const FULL_WEIGHT: f64 = 0.25;
 /// roulette and sends a ray.
 ///
 /// Source: Arvo & Kirk, "Particle Transport and Image Synthesis" (1990).
-fn survival_probability(view: &View<'_>, weight: f64) -> f64 {
-    if view.header.features.has_emitters == Features::UNAIMED {
-        return 1.0;
-    }
+fn survival_probability(weight: f64) -> f64 {
     (weight * (1.0 / FULL_WEIGHT)).clamp(f64::MIN_POSITIVE, 1.0)
 }
 
@@ -97,7 +94,7 @@ impl Gatherer {
         self.queue.clear();
         for (k, point) in points.iter().enumerate() {
             let numbers = samples[point.sample].gather_numbers(point.node);
-            let survival = survival_probability(view, point.weight);
+            let survival = survival_probability(point.weight);
             if survival < 1.0 && numbers.roulette() >= survival {
                 continue;
             }
@@ -169,7 +166,7 @@ impl Gatherer {
                 });
             }
         }
-        let throughput = path.throughput * material.clearness();
+        let throughput = path.throughput * material.transmittance();
         if throughput > 0.0 {
             let ray = Ray { origin: position, leaving: surface, after: hit.rank, ..*ray };
             self.next.push(ray, Path { throughput, distance, ..path });

@@ -118,7 +118,7 @@ fn sphere_form_factor(cosine: f64, sine: f64) -> f64 {
 /// few directions to the part next to the receiver.
 fn polygon_importance(view: &View<'_>, emitter: &EmitterRecord, receiver: &Receiver) -> Importance {
     let middle = DVec3::from_array(emitter.middle) - receiver.position;
-    let toward = DVec3::from_array(emitter.turned_area).dot(middle);
+    let toward = DVec3::from_array(emitter.vector_area).dot(middle);
     let radiosity = emitter.radiosity[usize::from(toward > 0.0)];
     let squared = middle.length_squared();
     // Nearness is the form factor of a disc of the polygon's area at the best angle, 0..=1.

@@ -10,10 +10,7 @@ use super::{
     tree::LightCut,
 };
 use crate::{
-    prepared::{
-        layout::View,
-        record::{EmitterRecord, Features},
-    },
+    prepared::{layout::View, record::EmitterRecord},
     sample::GatherNumbers,
 };
 
@@ -59,7 +56,8 @@ pub(super) fn sample_light(
     receiver: &Receiver,
     numbers: &GatherNumbers,
 ) -> Option<LightSample> {
-    if view.header.features.has_emitters == Features::UNAIMED {
+    // No emitter on record can be chosen.
+    if view.emitters.is_empty() {
         return sample_hemisphere(receiver, 1.0, numbers.direction());
     }
     let cut = LightCut::new(view, receiver);
@@ -131,7 +129,7 @@ fn relative_density(
         }
     } else {
         // Per solid angle distance² / (area · cosine there), over cosine / π.
-        PI * (distance * distance) / DVec3::from_array(emitter.turned_area).dot(direction).abs()
+        PI * (distance * distance) / DVec3::from_array(emitter.vector_area).dot(direction).abs()
     };
     density / cosine
 }

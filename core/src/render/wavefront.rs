@@ -346,7 +346,7 @@ impl Wavefront {
     fn light(&mut self, view: &View<'_>, index: usize, isa: Isa) -> u64 {
         let light = &view.lights[index];
         let [position, intensity] = [light.position, light.intensity].map(DVec3::from_array);
-        let touches = view.touches(light);
+        let touches = view.coincident_surfaces(light);
         self.shadow_rays.clear();
         self.arrivals.clear();
         for (k, point) in self.points.iter().enumerate() {

@@ -189,23 +189,23 @@ fn neighbours(coordinate: f64, count: u32) -> ([usize; 2], f64) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{prepare::mip_maps::Pyramids, scene::Texture};
+    use crate::{prepare::mip_maps::MipMaps, scene::Texture};
 
-    fn image(width: u32, height: u32, texel: impl Fn(u32, u32) -> [u8; 3]) -> Pyramids {
+    fn image(width: u32, height: u32, texel: impl Fn(u32, u32) -> [u8; 3]) -> MipMaps {
         let texels =
             (0..height).flat_map(|y| (0..width).map(move |x| (x, y))).map(|(x, y)| texel(x, y));
         let texture = Texture { path: String::new(), width, height, texels: texels.collect() };
-        let mut pyramids = Pyramids::default();
-        pyramids.add(&texture);
-        pyramids
+        let mut mip_maps = MipMaps::default();
+        mip_maps.add(&texture);
+        mip_maps
     }
 
-    fn look(pyramids: &Pyramids) -> TextureView<'_> {
+    fn look(mip_maps: &MipMaps) -> TextureView<'_> {
         TextureView {
-            levels: &pyramids.levels,
-            fine: &pyramids.fine,
-            light_of_bytes: pyramids.transfer.light_of_bytes(),
-            coarse: &pyramids.coarse,
+            levels: &mip_maps.levels,
+            fine: &mip_maps.fine,
+            light_of_bytes: mip_maps.transfer.light_of_bytes(),
+            coarse: &mip_maps.coarse,
         }
     }
 
@@ -224,8 +224,8 @@ mod tests {
 
     #[test]
     fn a_point_is_bilinear_between_the_middles_of_texels() {
-        let pyramids = image(2, 2, |x, y| [255 * x as u8, 255 * y as u8, 255]);
-        let seen = |u, v| look(&pyramids).mean(&footprint([u, v], [[0.0; 2]; 2]));
+        let mip_maps = image(2, 2, |x, y| [255 * x as u8, 255 * y as u8, 255]);
+        let seen = |u, v| look(&mip_maps).mean(&footprint([u, v], [[0.0; 2]; 2]));
         assert_eq!(seen(0.25, 0.25), DVec3::new(0.0, 0.0, 1.0));
         assert_eq!(seen(0.75, 0.25), DVec3::new(1.0, 0.0, 1.0));
         assert_eq!(seen(0.25, 0.75), DVec3::new(0.0, 1.0, 1.0));
@@ -238,13 +238,13 @@ mod tests {
 
     #[test]
     fn nothing_is_too_large_too_long_or_no_number() {
-        let pyramids = image(5, 3, noise);
+        let mip_maps = image(5, 3, noise);
         for bad in [f64::NAN, f64::INFINITY, -f64::INFINITY, 1e300, -1e300, 1e17, 1e-300] {
             for at in 0..6 {
                 let mut numbers = [0.1, 0.2, 0.3, 0.4, 0.5, 0.6];
                 numbers[at] = bad;
                 let [u, v, a, b, c, d] = numbers;
-                let seen = look(&pyramids).mean(&footprint([u, v], [[a, b], [c, d]]));
+                let seen = look(&mip_maps).mean(&footprint([u, v], [[a, b], [c, d]]));
                 assert!((0.0..=1.0).contains(&seen.x), "{bad} at {at}: {seen}");
             }
         }
@@ -259,8 +259,8 @@ mod tests {
             for (k, [long, short]) in sides.into_iter().chain(sides).enumerate() {
                 let is_across = k < sides.len();
                 let (width, height) = if is_across { (count, 1) } else { (1, count) };
-                let pyramids = image(width, height, noise);
-                let truth = pyramids.fine.iter().fold(DVec3::ZERO, |sum, &[r, g, b, _]| {
+                let mip_maps = image(width, height, noise);
+                let truth = mip_maps.fine.iter().fold(DVec3::ZERO, |sum, &[r, g, b, _]| {
                     sum + DVec3::new(r.into(), g.into(), b.into()) / (255.0 * f64::from(count))
                 });
                 let steps = 40_000;
@@ -271,7 +271,7 @@ mod tests {
                     } else {
                         ([0.3, along], [[short, 0.0], [0.0, long]])
                     };
-                    look(&pyramids).mean(&footprint(at, sides))
+                    look(&mip_maps).mean(&footprint(at, sides))
                 });
                 let mean = seen.sum::<DVec3>() / f64::from(steps);
                 worst = worst.max((mean - truth).abs().max_element());
@@ -284,8 +284,8 @@ mod tests {
     #[test]
     fn probes_stand_along_the_longer_axis() {
         // Stripes that depend on v alone: a footprint along u sees them sharp.
-        let pyramids = image(64, 64, |_, y| [if y % 8 < 4 { 255 } else { 0 }; 3]);
-        let view = look(&pyramids);
+        let mip_maps = image(64, 64, |_, y| [if y % 8 < 4 { 255 } else { 0 }; 3]);
+        let view = look(&mip_maps);
         let (u, v) = (0.3, 2.0 / 64.0);
         let long = 12.0 / 64.0;
         assert_eq!(view.mean(&footprint([u, v], [[long, 0.0], [0.0, 1e-3]])), DVec3::ONE);

@@ -35,7 +35,7 @@ pub(crate) fn trace_shadows(
     shares: &mut Vec<f64>,
 ) {
     shares.clear();
-    let touches = view.touches(light);
+    let touches = view.coincident_surfaces(light);
     if view.header.features.has_clear_shadows() {
         run_with_kernel(isa, &mut ClearShadows { view, rays, touches, shares });
     } else {
@@ -112,7 +112,7 @@ impl KernelWork for ClearShadows<'_> {
             let mut is_blocked = false;
             visit(kernel, view, ray, &mut stack, |item| {
                 between(view, ray, &shear, self.touches, item, &mut scratch, |rank, part| {
-                    let share = Face { item, part }.material(view).clearness();
+                    let share = Face { item, part }.material(view).transmittance();
                     is_blocked |= share == 0.0;
                     crossed.push((rank, share));
                 });

@@ -54,7 +54,7 @@ pub(super) fn visit_nodes(
 ) {
     let mut box_ray = BoxRay::new(ray.origin, ray.direction, ray.reach, &view.header.frame);
     let mut waiting = 0;
-    let mut current = Child(0); // The root.
+    let mut current = Child::ROOT;
     loop {
         if current.is_leaf() {
             for &item in &view.items[current.items()] {

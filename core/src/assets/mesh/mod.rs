@@ -10,15 +10,15 @@ mod stl;
 
 use std::fmt;
 
-use hashbrown::{HashTable, hash_table::Entry};
+use hashbrown::hash_table::Entry;
 
 use glam::DVec3;
 
 use crate::{
     exact::{
-        hash::{mix, random_key},
         polygon,
         predicates::is_collinear,
+        welding::{PointHasher, PointTable},
     },
     scene::{Dropped, MeshShape, MeshVertices},
 };
@@ -146,9 +146,8 @@ pub fn read_mesh(path: &str, bytes: &[u8]) -> Result<MeshFile, MeshError> {
 #[derive(Debug)]
 pub(crate) struct MeshBuilder<T> {
     vertices: Vec<[T; 3]>,
-    vertex_table: HashTable<u32>,
+    vertex_table: PointTable,
     triangles: Vec<[u32; 3]>,
-    key: u64,
     dropped: Dropped,
 }
 
@@ -158,24 +157,18 @@ impl<T: Copy + Into<f64>> MeshBuilder<T> {
     pub(crate) fn with_capacity(vertices: usize, triangles: usize) -> Self {
         Self {
             vertices: Vec::with_capacity(vertices),
-            vertex_table: HashTable::with_capacity(vertices),
+            vertex_table: PointTable::new(PointHasher::new(), vertices),
             triangles: Vec::with_capacity(triangles),
-            key: random_key(),
             dropped: Dropped::default(),
         }
     }
 
     /// The index of the vertex at a finite position, in which no zero is negative.
     pub(crate) fn add_vertex(&mut self, position: [T; 3]) -> Result<u32, MeshFault> {
-        let (vertices, key) = (&self.vertices, self.key);
+        let vertices = &self.vertices;
         let bits = |position: &[T; 3]| position.map(|number| number.into().to_bits());
-        let wanted = bits(&position);
-        let hash = |bits: [u64; 3]| bits.into_iter().fold(key, mix);
-        let is_same = |&index: &u32| bits(&vertices[index as usize]) == wanted;
-        match self
-            .vertex_table
-            .entry(hash(wanted), is_same, |&index| hash(bits(&vertices[index as usize])))
-        {
+        let bits_at = |index: u32| bits(&vertices[index as usize]);
+        match self.vertex_table.entry(bits(&position), bits_at) {
             Entry::Occupied(known) => Ok(*known.get()),
             Entry::Vacant(place) => {
                 let index = u32::try_from(vertices.len()).map_err(|_| MeshFault::TooLarge)?;
@@ -271,7 +264,7 @@ impl<T: Copy + Into<f64>> MeshBuilder<T> {
         if self.triangles.is_empty() {
             return Err(MeshFault::Empty.of_file());
         }
-        self.vertex_table = HashTable::new();
+        self.vertex_table = PointTable::new(PointHasher::new(), 0); // Its memory is needed.
         self.drop_copies();
         let (mut kept, mut triangles) = (self.vertices, self.triangles);
         kept.shrink_to_fit();

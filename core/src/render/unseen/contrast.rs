@@ -92,7 +92,7 @@ impl Shares {
     fn of(material: &MaterialRecord) -> Self {
         let own = (1.0 - material.reflect) * material.alpha;
         let bends = material.refract != 0.0 && material.refract != 1.0;
-        let straight = if bends { 0.0 } else { material.clearness() };
+        let straight = if bends { 0.0 } else { material.transmittance() };
         // Exactly 0 where nothing is mirrored or bent.
         let other = if bends { 1.0 - own } else { material.reflect };
         debug_assert!((own + other + straight - 1.0).abs() < 1e-9);

@@ -34,7 +34,7 @@ impl FrustumSearch {
     ) -> bool {
         self.outlines.clear();
         self.waiting.clear();
-        self.waiting.push(Child(0)); // The root.
+        self.waiting.push(Child::ROOT);
         let frustum = Frustum::new(screen, &view.header.frame, beam);
         while let Some(child) = self.waiting.pop() {
             if child.is_leaf() {

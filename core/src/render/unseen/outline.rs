@@ -78,7 +78,7 @@ impl Outlines {
                 let solid = &view.solids[item.index()];
                 for (number, leaf) in (0..).zip(view.solid_leaves(solid)) {
                     // What is taken away is seen where something is left.
-                    if leaf.is_turned == 0 {
+                    if leaf.is_reversed == 0 {
                         self.add_leaf(view, screen, (item, number), leaf, beam);
                     }
                 }
