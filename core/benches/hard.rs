@@ -15,7 +15,7 @@ use rtfarm_core::{
     isa::Isa,
     prepare::prepare,
     prepared::PreparedScene,
-    render::{Quality, Sampling, Settings, render_tile},
+    render::{Quality, Sampling, render_tile},
     scene::{Scene, Viewport},
     tile::{Area, Size},
 };
@@ -92,9 +92,7 @@ fn coincident() -> Scene {
 fn picture(scene: &Scene) {
     let scene = PreparedScene::open(prepare(scene).expect("a plain scene")).expect("valid");
     let size = Size::new(160, 120).expect("a size");
-    let quality = Quality { sampling: Sampling::Fixed(4), ..Quality::default() };
-    let settings = Settings { size, quality };
-    let area = Area { x0: 0, y0: 0, width: 160, height: 120 };
+    let quality = Quality { sampling: Sampling::fixed(4).unwrap(), ..Quality::default() };
     let go_on = &mut || ControlFlow::Continue(());
-    render_tile(&scene, &settings, area, Isa::fastest(), go_on);
+    render_tile(&scene, &quality, Area::whole(size), Isa::fastest(), go_on);
 }

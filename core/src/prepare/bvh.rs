@@ -4,29 +4,29 @@
 //! Source: Wald, "On fast Construction of SAH-based Bounding Volume Hierarchies" (2007); eight
 //! wide by opening the largest child until there are eight, Wald, Benthin & Boulos, "Getting Rid
 //! of Packets" (2008). The same input gives the same bytes on any number of threads: bins hold
-//! minima, maxima and counts, which do not care for order, and every cut is made by one thread.
+//! minima, maxima and counts, which do not care for order, and every split is made by one thread.
 
 use rayon::prelude::*;
 
 use crate::prepared::node::{Child, Node};
 
-/// From this level on, cuts are made in the middle, so that a path ends within 28 more.
+/// From this level on, splits are made in the middle, so that a path ends within 28 more.
 const MEDIAN_LEVEL: usize = 32;
 
-/// Items below which a part is built by one thread.
+/// A range of fewer items is built by one thread.
 const SERIAL: usize = 4096;
 
 const BINS: usize = 16;
 
-/// Parts of up to this many faces are leaves. Cutting them further makes a triangle mesh no faster
-/// to trace and takes half as many bytes again.
+/// Ranges of up to this many faces are leaves. Splitting them further makes a triangle mesh no
+/// faster to trace and takes half as many bytes again.
 const LEAF: usize = 4;
 
 /// An axis-aligned box.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(crate) struct Bounds {
-    pub(crate) min: [f32; 3],
-    pub(crate) max: [f32; 3],
+pub(super) struct Bounds {
+    pub(super) min: [f32; 3],
+    pub(super) max: [f32; 3],
 }
 
 impl Bounds {
@@ -49,92 +49,92 @@ impl Bounds {
         if x < 0.0 { 0.0 } else { x * y + y * z + z * x }
     }
 
-    /// Twice the middle.
+    /// Twice the coordinate of the centre.
     #[inline(always)]
-    fn middle(&self, axis: usize) -> f32 {
+    fn twice_center(&self, axis: usize) -> f32 {
         self.min[axis] + self.max[axis]
     }
 }
 
-/// What goes into the hierarchy: a box and the number of the face in it.
+/// An item that the hierarchy is built over: its box and its number.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Leaflet {
-    pub(crate) bounds: Bounds,
-    pub(crate) face: u32,
+pub(super) struct BuildPrimitive {
+    pub(super) bounds: Bounds,
+    pub(super) item: u32,
 }
 
-/// A run of leaflets that will be a node or a leaf.
-struct Part<'a> {
-    leaflets: &'a mut [Leaflet],
+/// A run of primitives that will be a node or a leaf.
+struct BuildRange<'a> {
+    primitives: &'a mut [BuildPrimitive],
     /// The place of the first one in the whole order.
     first: usize,
     bounds: Bounds,
-    /// The bounds of twice the middles.
-    middles: Bounds,
+    /// The bounds of twice the centres.
+    centers: Bounds,
 }
 
-/// Builds the hierarchy over `leaflets` and brings them into the order in which leaves name them.
+/// Builds the hierarchy over `primitives` and brings them into the order in which leaves name them.
 /// The root is node 0; every other node stands after its parent.
-pub(crate) fn build_bvh(leaflets: &mut [Leaflet]) -> Vec<Node> {
-    if leaflets.is_empty() {
+pub(super) fn build_bvh(primitives: &mut [BuildPrimitive]) -> Vec<Node> {
+    if primitives.is_empty() {
         return vec![Node::EMPTY];
     }
-    build_node(Part::new(leaflets, 0), 0)
+    build_node(BuildRange::new(primitives, 0), 0)
 }
 
-impl<'a> Part<'a> {
-    fn new(leaflets: &'a mut [Leaflet], first: usize) -> Self {
-        let measure = |chunk: &[Leaflet]| {
-            chunk.iter().fold((Bounds::NONE, Bounds::NONE), |(bounds, middles), leaflet| {
-                let middle = [0, 1, 2].map(|axis| leaflet.bounds.middle(axis));
+impl<'a> BuildRange<'a> {
+    fn new(primitives: &'a mut [BuildPrimitive], first: usize) -> Self {
+        let measure = |chunk: &[BuildPrimitive]| {
+            chunk.iter().fold((Bounds::NONE, Bounds::NONE), |(bounds, centers), primitive| {
+                let middle = [0, 1, 2].map(|axis| primitive.bounds.twice_center(axis));
                 let point = Bounds { min: middle, max: middle };
-                (bounds.join(&leaflet.bounds), middles.join(&point))
+                (bounds.join(&primitive.bounds), centers.join(&point))
             })
         };
-        let (bounds, middles) = if leaflets.len() > 8 * SERIAL {
-            leaflets
+        let (bounds, centers) = if primitives.len() > 8 * SERIAL {
+            primitives
                 .par_chunks(SERIAL)
                 .map(measure)
                 .reduce(|| (Bounds::NONE, Bounds::NONE), |a, b| (a.0.join(&b.0), a.1.join(&b.1)))
         } else {
-            measure(leaflets)
+            measure(primitives)
         };
-        Self { leaflets, first, bounds, middles }
+        Self { primitives, first, bounds, centers }
     }
 
-    /// Cuts in two where it is cheapest.
-    fn cut(self, level: usize) -> [Self; 2] {
-        let cut = if level < MEDIAN_LEVEL { self.cheapest_cut() } else { None };
-        let at = match cut {
-            Some(cut) => cut.partition(self.leaflets),
-            None => self.leaflets.len() / 2, // Nothing tells them apart.
+    /// Splits in two where it is cheapest.
+    fn split(self, level: usize) -> [Self; 2] {
+        let split = if level < MEDIAN_LEVEL { self.cheapest_split() } else { None };
+        let at = match split {
+            Some(split) => split.partition(self.primitives),
+            None => self.primitives.len() / 2, // Nothing tells them apart.
         };
-        let (left, right) = self.leaflets.split_at_mut(at);
-        [Part::new(left, self.first), Part::new(right, self.first + at)]
+        let (left, right) = self.primitives.split_at_mut(at);
+        [BuildRange::new(left, self.first), BuildRange::new(right, self.first + at)]
     }
 
     fn is_leaf(&self) -> bool {
-        self.leaflets.len() <= LEAF
+        self.primitives.len() <= LEAF
     }
 
-    /// The cut between two bins with the least area x count on its sides; `None` where the
-    /// middles do not differ enough for bins.
-    fn cheapest_cut(&self) -> Option<Cut> {
+    /// The split between two bins with the least area x count on its sides; `None` where the
+    /// centres do not differ enough for bins.
+    fn cheapest_split(&self) -> Option<Split> {
         let scale = [0, 1, 2].map(|axis| {
-            let extent = self.middles.max[axis] - self.middles.min[axis];
+            let extent = self.centers.max[axis] - self.centers.min[axis];
             let scale = BINS as f32 * (1.0 - f32::EPSILON) / extent;
             if extent > 0.0 && scale.is_finite() { scale } else { 0.0 }
         });
-        let binning = Binning { low: self.middles.min, scale };
-        let bins = if self.leaflets.len() > 8 * SERIAL {
-            self.leaflets
+        let binning = Binning { low: self.centers.min, scale };
+        let bins = if self.primitives.len() > 8 * SERIAL {
+            self.primitives
                 .par_chunks(SERIAL)
                 .map(|chunk| binning.fill(chunk))
                 .reduce_with(|a, b| merge_bins(&a, &b))?
         } else {
-            binning.fill(self.leaflets)
+            binning.fill(self.primitives)
         };
-        let mut best: Option<Cut> = None;
+        let mut best: Option<Split> = None;
         for axis in (0..3).filter(|&axis| scale[axis] > 0.0) {
             let mut right_cost = [0.0; BINS];
             let mut side = Bin::EMPTY;
@@ -146,9 +146,9 @@ impl<'a> Part<'a> {
             for bin in 1..BINS {
                 side = side.join(&bins[axis][bin - 1]);
                 let cost = side.bounds.half_area() * side.count as f32 + right_cost[bin];
-                let is_cut = side.count > 0 && (side.count as usize) < self.leaflets.len();
-                if is_cut && best.as_ref().is_none_or(|best| cost < best.cost) {
-                    best = Some(Cut { axis, bin, cost, binning });
+                let is_split = side.count > 0 && (side.count as usize) < self.primitives.len();
+                if is_split && best.as_ref().is_none_or(|best| cost < best.cost) {
+                    best = Some(Split { axis, bin, cost, binning });
                 }
             }
         }
@@ -168,7 +168,7 @@ struct Bin {
     count: u32,
 }
 
-struct Cut {
+struct Split {
     axis: usize,
     bin: usize,
     cost: f32,
@@ -190,16 +190,16 @@ fn merge_bins(a: &[[Bin; BINS]; 3], b: &[[Bin; BINS]; 3]) -> [[Bin; BINS]; 3] {
 impl Binning {
     #[inline(always)]
     fn bin(&self, bounds: &Bounds, axis: usize) -> usize {
-        let bin = (bounds.middle(axis) - self.low[axis]) * self.scale[axis];
+        let bin = (bounds.twice_center(axis) - self.low[axis]) * self.scale[axis];
         (bin as usize).min(BINS - 1)
     }
 
-    fn fill(&self, leaflets: &[Leaflet]) -> [[Bin; BINS]; 3] {
+    fn fill(&self, primitives: &[BuildPrimitive]) -> [[Bin; BINS]; 3] {
         let mut bins = [[Bin::EMPTY; BINS]; 3];
-        for leaflet in leaflets {
+        for primitive in primitives {
             for (axis, bins) in bins.iter_mut().enumerate() {
-                let bin = &mut bins[self.bin(&leaflet.bounds, axis)];
-                bin.bounds = bin.bounds.join(&leaflet.bounds);
+                let bin = &mut bins[self.bin(&primitive.bounds, axis)];
+                bin.bounds = bin.bounds.join(&primitive.bounds);
                 bin.count += 1;
             }
         }
@@ -207,71 +207,68 @@ impl Binning {
     }
 }
 
-impl Cut {
-    /// Brings those left of the cut to the front; how many they are.
-    fn partition(&self, leaflets: &mut [Leaflet]) -> usize {
-        let is_left = |leaflet: &Leaflet| self.binning.bin(&leaflet.bounds, self.axis) < self.bin;
-        let (mut left, mut right) = (0, leaflets.len());
+impl Split {
+    /// Brings those left of the split to the front; returns how many they are.
+    fn partition(&self, primitives: &mut [BuildPrimitive]) -> usize {
+        let is_left =
+            |primitive: &BuildPrimitive| self.binning.bin(&primitive.bounds, self.axis) < self.bin;
+        let (mut left, mut right) = (0, primitives.len());
         loop {
-            while left < right && is_left(&leaflets[left]) {
+            while left < right && is_left(&primitives[left]) {
                 left += 1;
             }
-            while left < right && !is_left(&leaflets[right - 1]) {
+            while left < right && !is_left(&primitives[right - 1]) {
                 right -= 1;
             }
             if left >= right {
                 return left;
             }
-            leaflets.swap(left, right - 1);
+            primitives.swap(left, right - 1);
         }
     }
 }
 
-/// The nodes of one part, its own first; children's indices count from it.
-fn build_node(part: Part<'_>, level: usize) -> Vec<Node> {
-    let mut parts = vec![part];
-    while parts.len() < 8 {
-        let widest = (0..parts.len())
-            .filter(|&k| !parts[k].is_leaf())
-            .max_by(|&a, &b| parts[a].bounds.half_area().total_cmp(&parts[b].bounds.half_area()));
+/// The nodes of one range, its own first; children's indices count from it.
+fn build_node(range: BuildRange<'_>, level: usize) -> Vec<Node> {
+    let mut ranges = vec![range];
+    while ranges.len() < 8 {
+        let widest = (0..ranges.len())
+            .filter(|&k| !ranges[k].is_leaf())
+            .max_by(|&a, &b| ranges[a].bounds.half_area().total_cmp(&ranges[b].bounds.half_area()));
         let Some(widest) = widest else { break };
-        let halves = parts.swap_remove(widest).cut(level);
-        parts.extend(halves);
+        let halves = ranges.swap_remove(widest).split(level);
+        ranges.extend(halves);
     }
-    parts.sort_by_key(|part| part.first);
+    ranges.sort_by_key(|range| range.first);
     let mut node = Node::EMPTY;
-    for (k, part) in parts.iter().enumerate() {
+    for (k, range) in ranges.iter().enumerate() {
         for axis in 0..3 {
-            node.planes[axis][k] = part.bounds.min[axis];
-            node.planes[axis + 3][k] = part.bounds.max[axis];
+            node.planes[axis][k] = range.bounds.min[axis];
+            node.planes[axis + 3][k] = range.bounds.max[axis];
         }
     }
-    let total: usize = parts.iter().map(|part| part.leaflets.len()).sum();
-    let build = |part: Part<'_>| {
-        if part.is_leaf() {
-            Err(Child::leaf(part.first, part.leaflets.len()))
+    let total: usize = ranges.iter().map(|range| range.primitives.len()).sum();
+    let build = |range: BuildRange<'_>| {
+        if range.is_leaf() {
+            Err(Child::leaf(range.first, range.primitives.len()))
         } else {
-            Ok(build_node(part, level + 1))
+            Ok(build_node(range, level + 1))
         }
     };
     let built: Vec<Result<Vec<Node>, Child>> = if total > SERIAL {
-        parts.into_par_iter().map(build).collect()
+        ranges.into_par_iter().map(build).collect()
     } else {
-        parts.into_iter().map(build).collect()
+        ranges.into_iter().map(build).collect()
     };
     let mut nodes = vec![node];
     for (k, child) in built.into_iter().enumerate() {
         match child {
             Err(leaf) => nodes[0].children[k] = leaf,
             Ok(subtree) => {
-                let offset = nodes.len() as u32;
-                nodes[0].children[k] = Child(offset);
+                let offset = nodes.len();
+                nodes[0].children[k] = Child::inner(offset);
                 nodes.extend(subtree.into_iter().map(|mut node| {
-                    for child in &mut node.children {
-                        if *child != Child::NONE && !child.is_leaf() {
-                            child.0 += offset;
-                        }
-                    }
+                    node.children = node.children.map(|child| child.moved_by(offset));
                     node
                 }));
             }
@@ -288,12 +285,15 @@ mod tests {
     use crate::prepared::node::MOST_LEVELS;
 
     fn check(boxes: &[([f32; 3], [f32; 3])]) -> Vec<Node> {
-        let mut leaflets: Vec<Leaflet> = boxes
+        let mut primitives: Vec<BuildPrimitive> = boxes
             .iter()
             .enumerate()
-            .map(|(face, &(min, max))| Leaflet { bounds: Bounds { min, max }, face: face as u32 })
+            .map(|(item, &(min, max))| BuildPrimitive {
+                bounds: Bounds { min, max },
+                item: item as u32,
+            })
             .collect();
-        let nodes = build_bvh(&mut leaflets);
+        let nodes = build_bvh(&mut primitives);
         let mut seen = vec![0; boxes.len()];
         let mut levels = vec![1; nodes.len()];
         for (index, node) in nodes.iter().enumerate() {
@@ -307,11 +307,11 @@ mod tests {
                     levels[child.node()] = levels[index] + 1;
                     continue;
                 }
-                for leaflet in &leaflets[child.items()] {
-                    seen[leaflet.face as usize] += 1;
+                for primitive in &primitives[child.items()] {
+                    seen[primitive.item as usize] += 1;
                     for axis in 0..3 {
-                        assert!(node.planes[axis][k] <= leaflet.bounds.min[axis]);
-                        assert!(node.planes[axis + 3][k] >= leaflet.bounds.max[axis]);
+                        assert!(node.planes[axis][k] <= primitive.bounds.min[axis]);
+                        assert!(node.planes[axis + 3][k] >= primitive.bounds.max[axis]);
                     }
                 }
             }
@@ -361,14 +361,17 @@ mod tests {
         HardCase::CentroidsOneUlpApart.tell("middles one ulp apart end in leaves", measured);
     }
 
-    type Cutter = fn(&Part<'_>) -> Option<(usize, usize, f32)>;
+    type Splitter = fn(&BuildRange<'_>) -> Option<(usize, usize, f32)>;
 
-    /// The cheapest of all cuts between neighbours in the order of their middles: axis, place, cost.
-    fn swept_cut(part: &Part<'_>) -> Option<(usize, usize, f32)> {
+    /// The cheapest of all splits between neighbours in the order of their centres: axis, place,
+    /// cost.
+    fn swept_split(range: &BuildRange<'_>) -> Option<(usize, usize, f32)> {
         let mut best: Option<(usize, usize, f32)> = None;
         for axis in 0..3 {
-            let mut sorted = part.leaflets.to_vec();
-            sorted.sort_by(|a, b| a.bounds.middle(axis).total_cmp(&b.bounds.middle(axis)));
+            let mut sorted = range.primitives.to_vec();
+            sorted.sort_by(|a, b| {
+                a.bounds.twice_center(axis).total_cmp(&b.bounds.twice_center(axis))
+            });
             let mut right_cost = vec![0.0; sorted.len()];
             let mut side = Bounds::NONE;
             for k in (1..sorted.len()).rev() {
@@ -387,23 +390,23 @@ mod tests {
         best
     }
 
-    /// What a binary tree costs by the surface area heuristic, cut by cut, in areas of the root:
-    /// with the builder's cuts, or where `cutter` says.
-    fn cost(part: Part<'_>, cutter: Option<Cutter>, root_area: f64) -> f64 {
-        let area = f64::from(part.bounds.half_area()) / root_area;
-        if part.is_leaf() {
-            return area * part.leaflets.len() as f64;
+    /// The cost of a binary tree by the surface area heuristic, split by split, in areas of the
+    /// root: with the builder's splits, or where `splitter` says.
+    fn cost(range: BuildRange<'_>, splitter: Option<Splitter>, root_area: f64) -> f64 {
+        let area = f64::from(range.bounds.half_area()) / root_area;
+        if range.is_leaf() {
+            return area * range.primitives.len() as f64;
         }
-        let halves = match cutter.and_then(|cutter| cutter(&part)) {
-            None => part.cut(0),
+        let halves = match splitter.and_then(|splitter| splitter(&range)) {
+            None => range.split(0),
             Some((axis, at, _)) => {
-                let middle = |leaflet: &Leaflet| leaflet.bounds.middle(axis);
-                part.leaflets.sort_by(|a, b| middle(a).total_cmp(&middle(b)));
-                let (left, right) = part.leaflets.split_at_mut(at);
-                [Part::new(left, 0), Part::new(right, 0)]
+                let middle = |primitive: &BuildPrimitive| primitive.bounds.twice_center(axis);
+                range.primitives.sort_by(|a, b| middle(a).total_cmp(&middle(b)));
+                let (left, right) = range.primitives.split_at_mut(at);
+                [BuildRange::new(left, 0), BuildRange::new(right, 0)]
             }
         };
-        area + halves.into_iter().map(|half| cost(half, cutter, root_area)).sum::<f64>()
+        area + halves.into_iter().map(|half| cost(half, splitter, root_area)).sum::<f64>()
     }
 
     #[test]
@@ -413,17 +416,17 @@ mod tests {
         let shrunk = |point: [f32; 3]| point.map(|x| x * 1e-6);
         let teapot = scattered(2000).into_iter().map(|(min, max)| (shrunk(min), shrunk(max)));
         boxes.extend(teapot);
-        let leaflets: Vec<Leaflet> = (0..)
+        let primitives: Vec<BuildPrimitive> = (0..)
             .zip(boxes)
-            .map(|(face, (min, max))| Leaflet { bounds: Bounds { min, max }, face })
+            .map(|(item, (min, max))| BuildPrimitive { bounds: Bounds { min, max }, item })
             .collect();
-        let cost_of = |cutter| {
-            let mut leaflets = leaflets.clone();
-            let part = Part::new(&mut leaflets, 0);
-            let area = f64::from(part.bounds.half_area());
-            cost(part, cutter, area)
+        let cost_of = |splitter| {
+            let mut primitives = primitives.clone();
+            let range = BuildRange::new(&mut primitives, 0);
+            let area = f64::from(range.bounds.half_area());
+            cost(range, splitter, area)
         };
-        let (binned, swept) = (cost_of(None), cost_of(Some(swept_cut as Cutter)));
+        let (binned, swept) = (cost_of(None), cost_of(Some(swept_split as Splitter)));
         HardCase::TeapotInStadium.tell(
             "a teapot in a stadium a million times its size costs as with a full sweep",
             format!("{:.3} times {swept:.1}", binned / swept),

@@ -4,17 +4,20 @@ use glam::DVec3;
 
 use crate::prepared::record::{EmitterNode, EmitterRecord, NO_NODE};
 
-/// What the tree is made of: an emitter's bounding ball, its area and what it sends on.
+/// The sphere around an emitter, and its area.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Twig {
-    pub(crate) center: DVec3,
-    pub(crate) radius: f64,
-    pub(crate) area: f64,
+pub(super) struct EmitterBounds {
+    pub(super) center: DVec3,
+    pub(super) radius: f64,
+    pub(super) area: f64,
 }
 
-/// Builds the tree over `emitters`, of which `twigs` tells more, and enters their nodes in them.
+/// Builds the tree over `emitters`, of which `bounds` tells more, and enters their nodes in them.
 /// The root is node 0, two children stand side by side after their parent.
-pub(crate) fn build_tree(emitters: &mut [EmitterRecord], twigs: &[Twig]) -> Vec<EmitterNode> {
+pub(super) fn build_emitter_tree(
+    emitters: &mut [EmitterRecord],
+    bounds: &[EmitterBounds],
+) -> Vec<EmitterNode> {
     if emitters.is_empty() {
         return Vec::new();
     }
@@ -34,7 +37,7 @@ pub(crate) fn build_tree(emitters: &mut [EmitterRecord], twigs: &[Twig]) -> Vec<
         let (mut min, mut max) = (low, high);
         let (mut area, mut power) = (0.0, 0.0);
         for &emitter in part.iter() {
-            let Twig { center, radius, area: own } = twigs[emitter as usize];
+            let EmitterBounds { center, radius, area: own } = bounds[emitter as usize];
             (low, high) = (low.min(center), high.max(center));
             (min, max) = (min.min(center - radius), max.max(center + radius));
             area += own;
@@ -51,13 +54,13 @@ pub(crate) fn build_tree(emitters: &mut [EmitterRecord], twigs: &[Twig]) -> Vec<
         };
         let center = min + (max - min) / 2.0;
         let reach = |&emitter: &u32| {
-            let Twig { center: of_emitter, radius, .. } = twigs[emitter as usize];
+            let EmitterBounds { center: of_emitter, radius, .. } = bounds[emitter as usize];
             (of_emitter - center).length() + radius
         };
         let radius = part.iter().map(reach).fold(0.0, f64::max);
         let middle = part.len() / 2;
         part.select_nth_unstable_by(middle, |&a, &b| {
-            let place = |emitter: u32| twigs[emitter as usize].center[axis];
+            let place = |emitter: u32| bounds[emitter as usize].center[axis];
             place(a).total_cmp(&place(b)).then(a.cmp(&b))
         });
         let child = nodes.len();

@@ -2,54 +2,115 @@
 
 use glam::{DVec2, DVec3};
 
-use super::emitter_tree::{Twig, build_tree};
-use crate::prepared::record::{EmitterNode, EmitterRecord, LightRecord, MaterialRecord, NO_NODE};
+use super::{
+    emitter_tree::{EmitterBounds, build_emitter_tree},
+    sort::Sorted,
+};
+use crate::{
+    exact::clip::clip,
+    prepared::{
+        face::Part,
+        record::{EmitterNode, EmitterRecord, LightRecord, MaterialRecord, NO_NODE},
+    },
+};
 
-/// The most lights that are asked about one face; of more, every second, third and so on stands
+/// At most so many lights are asked about one face; of more, every second, third and so on stands
 /// for those between.
 const MOST_LIGHTS: usize = 256;
 
-/// Takes in faces, in any order, and keeps those that send light on.
-pub(crate) struct Emitters<'a> {
+/// The faces that send light on, by their ranks, and the tree over them.
+#[derive(Default)]
+pub(super) struct Emitters {
+    pub(super) records: Vec<EmitterRecord>,
+    pub(super) nodes: Vec<EmitterNode>,
+}
+
+impl Emitters {
+    /// Finds all faces that send light on, which they have from `lights` and from all around. Those
+    /// of solids may need vertices that no other face has.
+    pub(super) fn find(
+        faces: &mut Sorted,
+        materials: &[MaterialRecord],
+        lights: &[LightRecord],
+        ambient: DVec3,
+    ) -> Self {
+        if !materials.iter().any(MaterialRecord::emits) {
+            return Self::default();
+        }
+        let mut search = Search { materials, lights, ambient, found: Vec::new() };
+        for face in &faces.triangles {
+            search.add_polygon((face.material, face.rank), &face.vertices, &faces.vertices);
+        }
+        for face in &faces.coplanars {
+            search.add_polygon((face.material, face.rank), &face.vertices, &faces.vertices);
+        }
+        for face in &faces.quadrangles {
+            search.add_polygon((face.material, face.rank), &face.vertices, &faces.vertices);
+        }
+        for sphere in &faces.spheres {
+            search.add_sphere((sphere.material, sphere.rank), sphere.center, sphere.radius);
+        }
+        let mut box_corners = faces.box_corners.chunks(4);
+        for (solid, &bounds) in faces.solids_in_file_order.iter().zip(&faces.solid_bounds) {
+            for (number, leaf) in (0..).zip(&faces.leaves[solid.leaves()]) {
+                let rank = |face: u32| Part::new(number, face).rank(solid);
+                if leaf.is_sphere() {
+                    let (center, radius) =
+                        smaller_sphere(DVec3::from_array(leaf.center), leaf.radius, bounds);
+                    search.add_sphere((leaf.material, rank(0)), center.to_array(), radius);
+                    continue;
+                }
+                for (face, corners) in (0..).zip(box_corners.by_ref().take(6)) {
+                    if !search.is_emitter(leaf.material) {
+                        continue;
+                    }
+                    // The solid has nothing of the others.
+                    let Some(corners) = part_within(corners, bounds) else { continue };
+                    let first = faces.vertices.len() as u32;
+                    faces.vertices.extend(corners.iter().map(DVec3::to_array));
+                    let vertices = [first, first + 1, first + 2, first + 3];
+                    search.add_polygon((leaf.material, rank(face)), &vertices, &faces.vertices);
+                }
+            }
+        }
+        search.finish()
+    }
+}
+
+/// The search for faces that send light on: it is given all faces, in any order.
+struct Search<'a> {
     materials: &'a [MaterialRecord],
     lights: &'a [LightRecord],
     ambient: DVec3,
-    found: Vec<(EmitterRecord, Twig)>,
+    found: Vec<(EmitterRecord, EmitterBounds)>,
 }
 
-impl<'a> Emitters<'a> {
-    pub(crate) fn new(
-        materials: &'a [MaterialRecord],
-        lights: &'a [LightRecord],
-        ambient: DVec3,
-    ) -> Self {
-        Self { materials, lights, ambient, found: Vec::new() }
-    }
-
-    pub(crate) fn is_one(&self, material: u32) -> bool {
+impl<'a> Search<'a> {
+    /// Whether faces of a material send light on.
+    fn is_emitter(&self, material: u32) -> bool {
         self.materials[material as usize].emits()
     }
 
-    /// A triangle or a simple quadrangle.
-    pub(crate) fn add_polygon(
+    /// Adds a triangle or a simple quadrangle, if it sends light on.
+    fn add_polygon(
         &mut self,
         (material, rank): (u32, u32),
         vertices: &[u32],
         all_vertices: &[[f64; 3]],
     ) {
-        if !self.is_one(material) {
+        if !self.is_emitter(material) {
             return;
         }
         let mut vertices: [u32; 4] = std::array::from_fn(|k| vertices[k.min(vertices.len() - 1)]);
         let mut corners = vertices.map(|vertex| DVec3::from_array(all_vertices[vertex as usize]));
-        let turned_area = 0.5 * (corners[2] - corners[0]).cross(corners[3] - corners[1]);
-        let area = turned_area.length();
+        let vector_area = 0.5 * (corners[2] - corners[0]).cross(corners[3] - corners[1]);
+        let area = vector_area.length();
         if area == 0.0 {
             return; // Below what numbers hold: nothing can be aimed at it.
         }
         // The diagonal between the first and the third corner is to be the one inside.
         let [b, c, d] = [1, 2, 3].map(|k| corners[k] - corners[0]);
-        if b.cross(c).dot(turned_area) < 0.0 || c.cross(d).dot(turned_area) < 0.0 {
+        if b.cross(c).dot(vector_area) < 0.0 || c.cross(d).dot(vector_area) < 0.0 {
             vertices.rotate_left(1);
             corners.rotate_left(1);
         }
@@ -61,7 +122,7 @@ impl<'a> Emitters<'a> {
             let position = DVec3::from_array(light.position);
             for &corner in outline {
                 let to_light = position - (middle + 0.8 * (corner - middle));
-                let height = turned_area.dot(to_light) / area;
+                let height = vector_area.dot(to_light) / area;
                 let distance = to_light.length();
                 if distance > 0.0 {
                     let share = height.abs() / (distance * distance * distance);
@@ -74,7 +135,7 @@ impl<'a> Emitters<'a> {
         let radius = outline.iter().map(reach).fold(0.0, f64::max);
         let record = EmitterRecord {
             middle: middle.to_array(),
-            turned_area: turned_area.to_array(),
+            vector_area: vector_area.to_array(),
             size: area,
             radiosity: received.map(|light| self.radiosity(material, light)),
             vertices,
@@ -83,17 +144,12 @@ impl<'a> Emitters<'a> {
             node: NO_NODE,
             by_size: 0,
         };
-        self.found.push((record, Twig { center: middle, radius, area }));
+        self.found.push((record, EmitterBounds { center: middle, radius, area }));
     }
 
-    /// A sphere: only its outside is aimed at.
-    pub(crate) fn add_sphere(
-        &mut self,
-        (material, rank): (u32, u32),
-        center: [f64; 3],
-        radius: f64,
-    ) {
-        if !self.is_one(material) {
+    /// Adds a sphere, if it sends light on. Only its outside is aimed at.
+    fn add_sphere(&mut self, (material, rank): (u32, u32), center: [f64; 3], radius: f64) {
+        if !self.is_emitter(material) {
             return;
         }
         let center = DVec3::from_array(center);
@@ -113,7 +169,7 @@ impl<'a> Emitters<'a> {
         }
         let record = EmitterRecord {
             middle: center.to_array(),
-            turned_area: [0.0; 3],
+            vector_area: [0.0; 3],
             size: radius,
             radiosity: [self.radiosity(material, received); 2],
             vertices: [0; 4],
@@ -123,29 +179,30 @@ impl<'a> Emitters<'a> {
             by_size: 0,
         };
         let area = 4.0 * std::f64::consts::PI * (radius * radius);
-        self.found.push((record, Twig { center, radius, area }));
+        self.found.push((record, EmitterBounds { center, radius, area }));
     }
 
-    /// All, by their ranks, and the tree over them.
-    pub(crate) fn finish(mut self) -> (Vec<EmitterRecord>, Vec<EmitterNode>) {
+    /// Sorts what was found and builds the tree.
+    fn finish(mut self) -> Emitters {
         self.found.sort_unstable_by_key(|(record, _)| record.rank);
-        let (mut emitters, twigs): (Vec<_>, Vec<_>) = self.found.into_iter().unzip();
-        let mut by_size: Vec<u32> = (0..emitters.len() as u32).collect();
-        by_size.sort_by(|&a, &b| twigs[b as usize].area.total_cmp(&twigs[a as usize].area));
-        for (emitter, by_size) in emitters.iter_mut().zip(by_size) {
+        let (mut records, bounds): (Vec<EmitterRecord>, Vec<_>) = self.found.into_iter().unzip();
+        let mut by_size: Vec<u32> = (0..records.len() as u32).collect();
+        by_size.sort_by(|&a, &b| bounds[b as usize].area.total_cmp(&bounds[a as usize].area));
+        for (emitter, by_size) in records.iter_mut().zip(by_size) {
             emitter.by_size = by_size;
         }
-        let nodes = build_tree(&mut emitters, &twigs);
-        (emitters, nodes)
+        let nodes = build_emitter_tree(&mut records, &bounds);
+        Emitters { records, nodes }
     }
 
-    /// Lights that stand for all, and for how many each.
+    /// Lights that stand for all others, and for how many each of them stands.
     fn some_lights(&self) -> impl Iterator<Item = (&'a LightRecord, f64)> {
         let step = self.lights.len().div_ceil(MOST_LIGHTS).max(1);
         self.lights.iter().step_by(step).map(move |light| (light, step as f64))
     }
 
-    /// What a face sends on in its brightest channel where it receives this from the lights.
+    /// The light that a face sends on in its brightest channel where it receives `light` from the
+    /// lights.
     fn radiosity(&self, material: u32, light: DVec3) -> f64 {
         let material = &self.materials[material as usize];
         let sent = DVec3::from_array(material.color) * (self.ambient + light);
@@ -153,8 +210,8 @@ impl<'a> Emitters<'a> {
     }
 }
 
-/// The smaller of a ball and the one around `bounds`: a solid's face on the ball lies in both.
-pub(crate) fn smaller_ball(center: DVec3, radius: f64, (min, max): (DVec3, DVec3)) -> (DVec3, f64) {
+/// The smaller of a sphere and the one around `bounds`: a solid's face on the sphere lies in both.
+fn smaller_sphere(center: DVec3, radius: f64, (min, max): (DVec3, DVec3)) -> (DVec3, f64) {
     let around = (max - min).length() / 2.0;
     if around > 0.0 && around < radius {
         (min + (max - min) / 2.0, around)
@@ -165,18 +222,19 @@ pub(crate) fn smaller_ball(center: DVec3, radius: f64, (min, max): (DVec3, DVec3
 
 /// The part of a parallelogram, cut along its sides, that holds what lies within `bounds`; `None`
 /// where nothing does.
-pub(crate) fn within(corners: &[DVec3], (min, max): (DVec3, DVec3)) -> Option<[DVec3; 4]> {
+fn part_within(corners: &[DVec3], (min, max): (DVec3, DVec3)) -> Option<[DVec3; 4]> {
     let (start, right, up) = (corners[0], corners[1] - corners[0], corners[3] - corners[0]);
     // What lies on a bound is within it, whatever the rounding.
     let slack = 1e-9 * max.abs().max(min.abs()).max_element();
     let (min, max) = (min - slack, max + slack);
     // Places as shares of the two sides.
     let mut outline = vec![DVec2::ZERO, DVec2::X, DVec2::ONE, DVec2::Y];
+    let mut room = Vec::new();
     for axis in 0..3 {
         for (bound, sign) in [(min[axis], 1.0), (max[axis], -1.0)] {
             let height =
                 |at: DVec2| sign * (start[axis] + at.x * right[axis] + at.y * up[axis] - bound);
-            outline = clip(&outline, height);
+            clip(&mut outline, &mut room, height, |p, q, share| p + (q - p) * share);
         }
     }
     let none = (DVec2::ONE, DVec2::ZERO);
@@ -186,22 +244,4 @@ pub(crate) fn within(corners: &[DVec3], (min, max): (DVec3, DVec3)) -> Option<[D
         [(low.x, low.y), (high.x, low.y), (high.x, high.y), (low.x, high.y)]
             .map(|(x, y)| start + x * right + y * up)
     })
-}
-
-/// The part of a convex outline where `height` is not below 0.
-///
-/// Source: Sutherland & Hodgman, "Reentrant Polygon Clipping" (1974).
-fn clip(outline: &[DVec2], height: impl Fn(DVec2) -> f64) -> Vec<DVec2> {
-    let mut clipped = Vec::new();
-    for (k, &p) in outline.iter().enumerate() {
-        let q = outline[(k + 1) % outline.len()];
-        let (at_p, at_q) = (height(p), height(q));
-        if at_p >= 0.0 {
-            clipped.push(p);
-        }
-        if (at_p >= 0.0) != (at_q >= 0.0) {
-            clipped.push(p + (q - p) * (at_p / (at_p - at_q)));
-        }
-    }
-    clipped
 }

@@ -12,18 +12,18 @@ use crate::{
 
 /// Images with all their levels, `[y][x]` each.
 #[derive(Debug, Default)]
-pub(crate) struct Pyramids {
-    /// Of the images' texels.
+pub(crate) struct MipMaps {
+    /// The images' texels become light by this.
     pub(crate) transfer: Transfer,
     pub(crate) textures: Vec<TextureRecord>,
     pub(crate) levels: Vec<LevelRecord>,
-    /// Of the images themselves: red, green, blue as their files have them, and 0.
+    /// The texels of the images themselves: red, green, blue as their files have them, and 0.
     pub(crate) fine: Vec<[u8; 4]>,
-    /// Of all other levels: red, green, blue light.
+    /// The texels of all other levels: red, green, blue light.
     pub(crate) coarse: Vec<[f32; 3]>,
 }
 
-impl Pyramids {
+impl MipMaps {
     /// Adds an image: the same texels on any number of threads.
     pub(crate) fn add(&mut self, texture: &Texture) {
         let (mut width, mut height) = (texture.width, texture.height);
@@ -67,8 +67,8 @@ fn half_size(width: u32, height: u32, at: impl Fn(u32, u32) -> [f64; 3] + Sync) 
     texels.par_chunks_mut(columns as usize).zip(0..rows).for_each(|(row, y)| {
         for (texel, x) in row.iter_mut().zip(0..columns) {
             let mut sum = [0.0; 3];
-            for (y, down) in parts(y, height, rows) {
-                for (x, across) in parts(x, width, columns) {
+            for (y, down) in overlaps(y, height, rows) {
+                for (x, across) in overlaps(x, width, columns) {
                     for (sum, channel) in sum.iter_mut().zip(at(x, y)) {
                         *sum += down * across * channel;
                     }
@@ -82,7 +82,7 @@ fn half_size(width: u32, height: u32, at: impl Fn(u32, u32) -> [f64; 3] + Sync) 
 
 /// Which of `fine` parts of a line the `index`th of `coarse` parts covers, and how much of each, in
 /// units of 1 / `coarse` part: whole numbers whose sum is `fine`.
-fn parts(index: u32, fine: u32, coarse: u32) -> impl Iterator<Item = (u32, f64)> {
+fn overlaps(index: u32, fine: u32, coarse: u32) -> impl Iterator<Item = (u32, f64)> {
     let [index, fine, coarse] = [index, fine, coarse].map(u64::from);
     let (start, end) = (index * fine, (index + 1) * fine);
     (start / coarse..end.div_ceil(coarse)).map(move |part| {
@@ -107,8 +107,8 @@ mod tests {
         for (width, height) in [(1, 1), (2, 2), (64, 64), (3, 5), (1, 1000), (1023, 37), (640, 479)]
         {
             let texture = texture(width, height);
-            let mut pyramids = Pyramids::default();
-            pyramids.add(&texture);
+            let mut mip_maps = MipMaps::default();
+            mip_maps.add(&texture);
             let mean = |texels: &mut dyn Iterator<Item = [f64; 3]>, count: usize| {
                 texels
                     .fold([0.0; 3], |sum, texel| [0, 1, 2].map(|k| sum[k] + texel[k]))
@@ -116,14 +116,14 @@ mod tests {
             };
             let fine = &mut texture.texels.iter().map(|t| t.map(|c| f64::from(c) / 255.0));
             let truth = mean(fine, texture.texels.len());
-            for level in &pyramids.levels[1..] {
+            for level in &mip_maps.levels[1..] {
                 let start = level.offset as usize;
-                let texels = &pyramids.coarse[start..][..(level.width * level.height) as usize];
+                let texels = &mip_maps.coarse[start..][..(level.width * level.height) as usize];
                 let found = mean(&mut texels.iter().map(|t| t.map(f64::from)), texels.len());
                 let off = found.iter().zip(truth).map(|(f, t)| (f - t).abs()).fold(0.0, f64::max);
                 worst = worst.max(off);
             }
-            let last = pyramids.levels.last().unwrap();
+            let last = mip_maps.levels.last().unwrap();
             assert_eq!((last.width, last.height), (1, 1));
         }
         eprintln!("means are kept to {worst:.1e}");
@@ -135,10 +135,10 @@ mod tests {
         let texels = vec![[0, 255, 10], [255, 255, 200]];
         let texture = Texture { path: String::new(), width: 2, height: 1, texels };
         let coarse = |transfer: Transfer| {
-            let mut pyramids = Pyramids { transfer, ..Pyramids::default() };
-            pyramids.add(&texture);
-            assert_eq!(pyramids.fine, [[0, 255, 10, 0], [255, 255, 200, 0]]);
-            pyramids.coarse
+            let mut mip_maps = MipMaps { transfer, ..MipMaps::default() };
+            mip_maps.add(&texture);
+            assert_eq!(mip_maps.fine, [[0, 255, 10, 0], [255, 255, 200, 0]]);
+            mip_maps.coarse
         };
         assert_eq!(coarse(Transfer::None), [[0.5, 1.0, (210.0 / 510.0) as f32]]);
         let blue = [10.0, 200.0].map(|byte| Transfer::Srgb.decode(byte / 255.0));
@@ -153,9 +153,9 @@ mod tests {
         let texels = |threads| {
             let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
             pool.install(|| {
-                let mut pyramids = Pyramids::default();
-                pyramids.add(&texture(301, 203));
-                pyramids.coarse.iter().map(|texel| texel.map(f32::to_bits)).collect::<Vec<_>>()
+                let mut mip_maps = MipMaps::default();
+                mip_maps.add(&texture(301, 203));
+                mip_maps.coarse.iter().map(|texel| texel.map(f32::to_bits)).collect::<Vec<_>>()
             })
         };
         let one = texels(1);

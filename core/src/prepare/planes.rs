@@ -4,214 +4,132 @@
 //! another that lies on it. So faces in exactly the same plane share one plane record. Real
 //! scenes hold thousands of copies of one triangle, and labels that lie in a wall.
 
+use glam::DVec3;
 use rayon::prelude::*;
 
-use glam::DVec3;
+use super::{flat::FlatFaces, newell::unit_normal, plane_fingerprint::plane_fingerprints};
+use crate::{
+    exact::predicates::is_coplanar,
+    prepared::record::{PlaneIndex, PlaneRecord},
+};
 
-use crate::exact::float::{exact_product, power_of_two_below_inverse};
-
-/// A number that planes have in common exactly when they are the same plane, whichever points
-/// they are given by and whichever way they face.
-///
-/// Coordinates are m · 2^e, so the plane's equation is computed without rounding modulo the prime
-/// 2^61 - 1, in which powers of two are rotations, and scaled to a leading 1. Different planes
-/// agree with a probability of 2^-61. `None` for points on one line.
-pub(crate) fn plane_prints(
-    faces: usize,
-    corners: impl Fn(usize) -> [DVec3; 3] + Sync,
-) -> Vec<Option<u64>> {
-    const RUN: usize = 256;
-    let mut prints = vec![None; faces];
-    prints.par_chunks_mut(RUN).enumerate().for_each(|(run, prints)| {
-        // One inversion serves a whole run: Montgomery, "Speeding the Pollard and Elliptic Curve
-        // Methods of Factorization" (1987).
-        let mut equations = [[0; 4]; RUN];
-        let mut products = [1; RUN];
-        let mut product = 1;
-        for k in 0..prints.len() {
-            equations[k] = equation(corners(run * RUN + k));
-            products[k] = product;
-            if let Some(leading) = leading(&equations[k]) {
-                product = times(product, leading);
-            }
-        }
-        let mut inverse = power(product, PRIME - 2);
-        for k in (0..prints.len()).rev() {
-            let Some(leading) = leading(&equations[k]) else { continue };
-            let scale = times(inverse, products[k]);
-            inverse = times(inverse, leading);
-            let [a, b, c, d] = equations[k].map(|term| times(term, scale));
-            // Any fixed odd multipliers: two different quadruples rarely agree.
-            prints[k] = Some([b, c, d].into_iter().fold(a, |print: u64, term| {
-                (print.rotate_left(23) ^ term).wrapping_mul(0x9E37_79B9_7F4A_7C15)
-            }));
-        }
-    });
-    prints
+/// The planes of flat faces.
+pub(super) struct SharedPlanes {
+    /// `None` for a triangle that is alone in its plane.
+    pub(super) of_triangles: Vec<Option<PlaneIndex>>,
+    /// The planes of quadrangles that are items of their own.
+    pub(super) of_quadrangles: Vec<PlaneIndex>,
+    /// The planes of the parallelepipeds in solids.
+    pub(super) of_boxes: Vec<[PlaneIndex; 6]>,
+    pub(super) planes: Vec<PlaneRecord>,
 }
 
-/// Newell's normal of a polygon, of length 1, each component right to a few ulp of 1 however thin
-/// the polygon is: differences and products keep what rounding would take.
-///
-/// Source: Sutherland, Sproull & Schumacker, "A Characterization of Ten Hidden-Surface
-/// Algorithms" (1974), who credit M. E. Newell.
-pub(crate) fn unit_normal(corners: &[DVec3]) -> DVec3 {
-    let extent = corners.iter().map(|&c| (c - corners[0]).abs().max_element()).fold(0.0, f64::max);
-    let scale = power_of_two_below_inverse(extent);
-    let first = (corners[0] * scale).to_array();
-    let along = |corner: DVec3| {
-        let corner = (corner * scale).to_array();
-        [0, 1, 2].map(|axis| Pair::difference(corner[axis], first[axis]))
+/// Gives flat faces in exactly one plane one record, that of the face that comes first.
+/// `first_corners` has for each corner the first one in the same place.
+pub(super) fn share_planes(flat: &FlatFaces, first_corners: &[u32]) -> SharedPlanes {
+    let mut sharing = Sharing { flat, of_faces: vec![None; flat.count()], planes: Vec::new() };
+    sharing.share_exact_planes();
+    sharing.share_outlines(first_corners);
+    let Sharing { of_faces: mut of_triangles, planes, .. } = sharing;
+    let every = |faces: Vec<Option<PlaneIndex>>| -> Vec<PlaneIndex> {
+        faces.into_iter().map(|plane| plane.expect("every quadrangle is in a group")).collect()
     };
-    let mut sum = [Pair::ZERO; 3];
-    for edge in corners[1..].windows(2) {
-        let (u, v) = (along(edge[0]), along(edge[1]));
-        for (axis, sum) in sum.iter_mut().enumerate() {
-            let (i, j) = ((axis + 1) % 3, (axis + 2) % 3);
-            *sum = sum.plus(u[i].times(v[j])).plus(u[j].times(v[i]).negated());
-        }
-    }
-    let normal = DVec3::from_array(sum.map(|pair| pair.high + pair.low));
-    let normal = normal * power_of_two_below_inverse(normal.abs().max_element());
-    normal / normal.length()
+    let of_boxes = every(of_triangles.split_off(flat.item_count()));
+    let of_quadrangles = every(of_triangles.split_off(flat.triangle_count));
+    let (of_boxes, _) = of_boxes.as_chunks();
+    SharedPlanes { of_triangles, of_quadrangles, of_boxes: of_boxes.to_vec(), planes }
 }
 
-/// A number in two parts, of some 106 bits.
-/// Source: Dekker, "A floating-point technique for extending the available precision" (1971).
-#[derive(Clone, Copy)]
-struct Pair {
-    high: f64,
-    low: f64,
+/// Planes that are being given to faces.
+struct Sharing<'a> {
+    flat: &'a FlatFaces,
+    of_faces: Vec<Option<PlaneIndex>>,
+    planes: Vec<PlaneRecord>,
 }
 
-impl Pair {
-    const ZERO: Self = Self { high: 0.0, low: 0.0 };
-
-    /// a + b, exactly. Source: Knuth, "The Art of Computer Programming 2" (1969).
-    fn sum(a: f64, b: f64) -> Self {
-        let high = a + b;
-        let b_part = high - a;
-        Self { high, low: (a - (high - b_part)) + (b - b_part) }
-    }
-
-    fn difference(a: f64, b: f64) -> Self {
-        Self::sum(a, -b)
-    }
-
-    fn negated(self) -> Self {
-        Self { high: -self.high, low: -self.low }
-    }
-
-    fn plus(self, other: Self) -> Self {
-        let sum = Self::sum(self.high, other.high);
-        Self::sum(sum.high, sum.low + (self.low + other.low))
-    }
-
-    fn times(self, other: Self) -> Self {
-        let (high, low) = exact_product(self.high, other.high);
-        Self::sum(high, low + (self.high * other.low + self.low * other.high))
-    }
-}
-
-const PRIME: u64 = (1 << 61) - 1;
-
-/// a x + b y + c z = d with (a, b, c) the cross product of two edges.
-fn equation([p, q, r]: [DVec3; 3]) -> [u64; 4] {
-    let [p, q, r] = [p, q, r].map(|corner| corner.to_array().map(residue));
-    let along = |to: [u64; 3]| [0, 1, 2].map(|axis| minus(to[axis], p[axis]));
-    let (u, v) = (along(q), along(r));
-    let cross = |i: usize, j: usize| minus(times(u[i], v[j]), times(u[j], v[i]));
-    let normal = [cross(1, 2), cross(2, 0), cross(0, 1)];
-    let d = (0..3).fold(0, |sum, axis| plus(sum, times(normal[axis], p[axis])));
-    [normal[0], normal[1], normal[2], d]
-}
-
-fn leading(equation: &[u64; 4]) -> Option<u64> {
-    equation[..3].iter().copied().find(|&term| term != 0)
-}
-
-/// A finite number modulo the prime.
-fn residue(value: f64) -> u64 {
-    let bits = value.to_bits();
-    let exponent = (bits >> 52 & 0x7FF).cast_signed();
-    let fraction = bits & ((1 << 52) - 1);
-    let mantissa = if exponent == 0 { fraction } else { fraction | 1 << 52 };
-    let shift = (exponent.max(1) - 1075).rem_euclid(61) as u32;
-    // 2^61 = 1, so what leaves at the top comes in at the bottom.
-    let size = (mantissa << shift & PRIME) | mantissa >> (61 - shift);
-    if bits >> 63 == 1 { minus(0, size) } else { reduce(size) }
-}
-
-fn reduce(value: u64) -> u64 {
-    if value >= PRIME { value - PRIME } else { value }
-}
-
-fn plus(a: u64, b: u64) -> u64 {
-    reduce(a + b)
-}
-
-fn minus(a: u64, b: u64) -> u64 {
-    reduce(a + PRIME - b)
-}
-
-fn times(a: u64, b: u64) -> u64 {
-    let product = u128::from(a) * u128::from(b);
-    reduce((product as u64 & PRIME) + (product >> 61) as u64)
-}
-
-fn power(mut base: u64, mut exponent: u64) -> u64 {
-    let mut result = 1;
-    while exponent > 0 {
-        if exponent & 1 == 1 {
-            result = times(result, base);
-        }
-        base = times(base, base);
-        exponent >>= 1;
-    }
-    result
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    fn print(corners: [[f64; 3]; 3]) -> Option<u64> {
-        plane_prints(1, |_| corners.map(DVec3::from_array))[0]
-    }
-
-    #[test]
-    fn residues_add_and_multiply_like_the_numbers() {
-        for (a, b) in [(1.5, -2.25), (1e-300, 3.0), (0.1, 1024.0), (-7.0, -1e15)] {
-            // Both results are exact in f64 for the first and last pair only where they fit.
-            let product: f64 = a * b;
-            if product / b == a && (a == 1.5 || a == -7.0) {
-                assert_eq!(times(residue(a), residue(b)), residue(product));
+impl Sharing<'_> {
+    /// Gives faces in exactly one plane one record: triangles that have company, and quadrangles
+    /// whose corners are in one plane.
+    fn share_exact_planes(&mut self) {
+        let flat = self.flat;
+        let fingerprints = plane_fingerprints(flat.count(), |face| {
+            let corners = flat.corners_of(face);
+            match *corners {
+                // Any three corners do that are not in a line, if all four are in one plane.
+                [a, b, c, d] if (b - a).cross(c - a) == DVec3::ZERO => [a, c, d],
+                _ => [corners[0], corners[1], corners[2]],
             }
-            assert_eq!(plus(residue(a), residue(-a)), 0);
+        });
+        let mut by_plane: Vec<(u64, u32, u32)> = fingerprints
+            .into_iter()
+            .enumerate()
+            .filter(|&(face, _)| match *flat.corners_of(face) {
+                [a, b, c, d] => is_coplanar(a, b, c, d),
+                _ => true,
+            })
+            .filter_map(|(face, print)| Some((print?, flat.rank(face), face as u32)))
+            .collect();
+        by_plane.par_sort_unstable();
+        for group in by_plane.chunk_by(|a, b| a.0 == b.0) {
+            let first = group[0].2 as usize;
+            if group.len() > 1 || first >= flat.triangle_count {
+                self.share(group.iter().map(|&(_, _, face)| face as usize));
+            }
         }
-        assert_eq!(plus(residue(0.5), residue(0.25)), residue(0.75));
-        assert_eq!(times(residue(0.5), 2), 1);
     }
 
-    #[test]
-    fn faces_in_one_plane_share_a_print() {
-        // x + y + z = 1, three ways round.
-        let a = print([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]);
-        let b = print([[0.5, 0.25, 0.25], [0.0, 2.0, -1.0], [-3.0, 3.5, 0.5]]);
-        assert!(a.is_some());
-        assert_eq!(a, b);
+    /// Gives the other quadrangles, which are flat only within rounding, a record each; those with
+    /// the same corners share it.
+    fn share_outlines(&mut self, first_corners: &[u32]) {
+        let flat = self.flat;
+        let mut by_corners: Vec<([u32; 4], u32, usize)> = (flat.triangle_count..flat.count())
+            .filter(|&face| self.of_faces[face].is_none())
+            .map(|face| {
+                let mut corners = [0; 4];
+                corners.copy_from_slice(&first_corners[flat.corner_range(face)]);
+                corners.sort_unstable();
+                (corners, flat.rank(face), face)
+            })
+            .collect();
+        by_corners.sort_unstable();
+        for group in by_corners.chunk_by(|a, b| a.0 == b.0) {
+            self.share(group.iter().map(|&(_, _, face)| face));
+        }
     }
 
-    #[test]
-    fn a_plane_one_ulp_away_is_another() {
-        let flat = |y: f64| print([[0.0, y, 0.0], [1.0, y, 0.0], [0.0, y, 1.0]]);
-        assert_ne!(flat(1.0), flat(1.0 + f64::EPSILON));
-        assert_ne!(flat(0.0), flat(5e-324));
-        assert_eq!(flat(3.0), print([[7.0, 3.0, 0.1], [0.3, 3.0, 0.7], [0.0, 3.0, 1e9]]));
+    /// Gives faces, in the order of their ranks, the first one's plane.
+    fn share(&mut self, group: impl Iterator<Item = usize>) {
+        let mut group = group.peekable();
+        let plane = plane_of(self.flat, *group.peek().expect("a group has a face"));
+        let index = self.planes.len();
+        for face in group {
+            let is_reversed = normal_of(self.flat, face).dot(DVec3::from_array(plane.normal)) < 0.0;
+            self.of_faces[face] = Some(PlaneIndex::new(index, is_reversed));
+        }
+        self.planes.push(plane);
     }
+}
 
-    #[test]
-    fn points_on_a_line_have_no_plane() {
-        assert_eq!(print([[0.0; 3], [1.0, 2.0, 3.0], [2.0, 4.0, 6.0]]), None);
+/// The plane with Newell's normal through a triangle's first corner, which is in it exactly, or
+/// through the mean corner of a quadrangle, whose corners may be only nearly in one plane.
+fn plane_of(flat: &FlatFaces, face: usize) -> PlaneRecord {
+    let corners = flat.corners_of(face);
+    let point = if corners.len() == 3 {
+        corners[0]
+    } else {
+        let from_first: DVec3 = corners.iter().map(|&corner| corner - corners[0]).sum();
+        corners[0] + from_first / corners.len() as f64
+    };
+    PlaneRecord { point: point.to_array(), normal: normal_of(flat, face).to_array() }
+}
+
+/// The unit normal of a flat face.
+fn normal_of(flat: &FlatFaces, face: usize) -> DVec3 {
+    match face.checked_sub(flat.count() - flat.box_edges.len()) {
+        Some(of_box) => {
+            let [u, v] = flat.box_edges[of_box];
+            unit_normal(&[DVec3::ZERO, u, v])
+        }
+        None => unit_normal(flat.corners_of(face)),
     }
 }

@@ -1,43 +1,54 @@
-//! Equal vertices become one.
-
-use std::{
-    collections::HashMap,
-    hash::{BuildHasherDefault, Hasher},
-};
+//! The third step: corners in one place become one vertex.
 
 use glam::DVec3;
+use hashbrown::hash_table::Entry;
 use rayon::prelude::*;
 
+use super::{flat::FlatFaces, scale::Scaled, solid_trees::SolidTrees};
+use crate::{
+    exact::welding::{PointBits, PointHasher, PointTable},
+    prepared::record::SphereRecord,
+};
+
+/// All faces of a scene, with the corners that they share.
+pub(super) struct Welded {
+    pub(super) flat: FlatFaces,
+    pub(super) spheres: Vec<SphereRecord>,
+    pub(super) solids: SolidTrees,
+    /// For every corner of a flat face, the first corner in the same place.
+    pub(super) first_corners: Vec<u32>,
+}
+
+impl Scaled {
+    /// Finds the corners that faces share.
+    pub(super) fn weld(self) -> Welded {
+        let Self { flat, spheres, solids, .. } = self;
+        let first_corners = find_first_corners(&flat.corners);
+        Welded { flat, spheres, solids, first_corners }
+    }
+}
+
 /// For every corner, the first corner with the same coordinates, bit for bit.
-pub(crate) fn weld(corners: &[DVec3]) -> Vec<u32> {
+fn find_first_corners(corners: &[DVec3]) -> Vec<u32> {
     // Each thread keeps the corners of one share of all hashes; a corner's share depends on its
     // coordinates alone, so the answer does not depend on the number of shares.
     let shares = if corners.len() < 1 << 14 { 1 } else { rayon::current_num_threads() as u64 };
-    let hashes: Vec<u64> = corners.par_iter().map(hash).collect();
-    let parts: Vec<Vec<(u32, u32)>> = (0..shares)
+    let hasher = PointHasher::new();
+    let hashes: Vec<u64> = corners.par_iter().map(|&corner| hasher.hash(bits_of(corner))).collect();
+    let copies: Vec<Vec<(u32, u32)>> = (0..shares)
         .into_par_iter()
         .map(|share| {
-            let mut first: HashMap<u64, Vec1, BuildHasherDefault<Given>> = HashMap::default();
+            let mut table = PointTable::new(hasher.clone(), 0);
             let mut copies = Vec::new();
             for (corner, &hash) in (0_u32..).zip(&hashes) {
                 if (hash >> 32) % shares != share {
                     continue;
                 }
-                let same =
-                    |&other: &u32| is_same(corners[corner as usize], corners[other as usize]);
-                match first.entry(hash) {
-                    std::collections::hash_map::Entry::Vacant(free) => {
-                        free.insert(Vec1 { first: corner, rest: Vec::new() });
-                    }
-                    std::collections::hash_map::Entry::Occupied(mut taken) => {
-                        let taken = taken.get_mut();
-                        if same(&taken.first) {
-                            copies.push((corner, taken.first));
-                        } else if let Some(&other) = taken.rest.iter().find(|other| same(other)) {
-                            copies.push((corner, other));
-                        } else {
-                            taken.rest.push(corner);
-                        }
+                let bits_at = |corner: u32| bits_of(corners[corner as usize]);
+                match table.entry_with_hash(hash, bits_at(corner), bits_at) {
+                    Entry::Occupied(first) => copies.push((corner, *first.get())),
+                    Entry::Vacant(place) => {
+                        place.insert(corner);
                     }
                 }
             }
@@ -45,45 +56,14 @@ pub(crate) fn weld(corners: &[DVec3]) -> Vec<u32> {
         })
         .collect();
     let mut firsts: Vec<u32> = (0..corners.len() as u32).collect();
-    for (copy, first) in parts.into_iter().flatten() {
+    for (copy, first) in copies.into_iter().flatten() {
         firsts[copy as usize] = first;
     }
     firsts
 }
 
-/// Corners whose hashes agree: hardly ever more than one.
-struct Vec1 {
-    first: u32,
-    rest: Vec<u32>,
-}
-
-fn is_same(a: DVec3, b: DVec3) -> bool {
-    a.to_array().map(f64::to_bits) == b.to_array().map(f64::to_bits)
-}
-
-fn hash(corner: &DVec3) -> u64 {
-    corner.to_array().into_iter().fold(0, |hash: u64, x| {
-        let mixed = (hash.rotate_left(29) ^ x.to_bits()).wrapping_mul(0x9E37_79B9_7F4A_7C15);
-        mixed ^ mixed >> 32
-    })
-}
-
-/// Passes on a hash that was made before.
-#[derive(Default)]
-struct Given(u64);
-
-impl Hasher for Given {
-    fn finish(&self) -> u64 {
-        self.0
-    }
-
-    fn write(&mut self, _: &[u8]) {
-        unreachable!("only u64 keys")
-    }
-
-    fn write_u64(&mut self, value: u64) {
-        self.0 = value;
-    }
+fn bits_of(corner: DVec3) -> PointBits {
+    corner.to_array().map(f64::to_bits)
 }
 
 #[cfg(test)]
@@ -94,10 +74,13 @@ mod tests {
     fn equal_corners_get_the_first_ones_number() {
         let corners: Vec<DVec3> =
             (0..100_000).map(|k| DVec3::new(f64::from(k % 1000), f64::from(k % 7), 0.1)).collect();
-        let firsts = weld(&corners);
-        for (corner, &first) in firsts.iter().enumerate() {
-            assert_eq!(corners[corner], corners[first as usize]);
-            assert_eq!(first as usize, corner % 7000);
+        for threads in [1, 2, 5] {
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+            let firsts = pool.install(|| find_first_corners(&corners));
+            for (corner, &first) in firsts.iter().enumerate() {
+                assert_eq!(corners[corner], corners[first as usize]);
+                assert_eq!(first as usize, corner % 7000);
+            }
         }
     }
 }

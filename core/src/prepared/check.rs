@@ -1,15 +1,15 @@
-//! What readers of a prepared scene rely on, checked once when it is opened.
+//! The check of a prepared scene when it is opened: all that its readers rely on, once.
 
 use super::{
     layout::View,
     node::{Child, MOST_LEVELS, Node},
     record::{
-        EmitterNode, EmitterRecord, Kind, LEAF, LeafRecord, MaterialRecord, NO_NODE, NodeRecord,
-        PlaneIndex, TexturedFace,
+        EmitterNode, EmitterRecord, Kind, LeafRecord, MaterialRecord, NO_NODE, PlaneIndex,
+        SolidNodeKind, SolidNodeRecord, TexturedFace,
     },
 };
 
-/// Everything that readers rely on.
+/// Checks everything that readers rely on; the error names what is wrong.
 pub(super) fn check(view: &View<'_>) -> Result<(), &'static str> {
     let ensure = |holds: bool, what: &'static str| if holds { Ok(()) } else { Err(what) };
     let finite = |numbers: &[f64]| numbers.iter().all(|x| x.is_finite() && x.abs() < 1e100);
@@ -105,14 +105,14 @@ pub(super) fn check(view: &View<'_>) -> Result<(), &'static str> {
     for light in view.lights {
         let is_finite = light.intensity.iter().all(|channel| channel.is_finite());
         ensure(finite(&light.position) && is_finite, "a light")?;
-        let end = light.touches_first as usize + light.touches_count as usize;
-        ensure(end <= view.touches.len(), "a light")?;
+        let end = light.coincident_first as usize + light.coincident_count as usize;
+        ensure(end <= view.coincident.len(), "a light")?;
     }
     check_textures(view)?;
     check_emitters(view)
 }
 
-/// What those rely on who look at textures.
+/// Checks what readers of textures rely on.
 fn check_textures(view: &View<'_>) -> Result<(), &'static str> {
     let ensure = |holds: bool, what: &'static str| if holds { Ok(()) } else { Err(what) };
     let finite = |numbers: &[f64]| numbers.iter().all(|x| x.is_finite() && x.abs() < 1e100);
@@ -131,7 +131,7 @@ fn check_textures(view: &View<'_>) -> Result<(), &'static str> {
     ensure(texels.iter().all(|channel| (0.0..=1.0).contains(channel)), "a texel")
 }
 
-/// What those rely on who aim at emitters.
+/// Checks what those rely on who aim at emitters.
 fn check_emitters(view: &View<'_>) -> Result<(), &'static str> {
     let ensure = |holds: bool, what: &'static str| if holds { Ok(()) } else { Err(what) };
     let finite = |numbers: &[f64]| numbers.iter().all(|x| x.is_finite() && x.abs() < 1e100);
@@ -139,7 +139,7 @@ fn check_emitters(view: &View<'_>) -> Result<(), &'static str> {
         emitter.vertices.iter().all(|&k| (k as usize) < view.vertices.len()) || emitter.is_sphere()
     };
     for emitter in view.emitters {
-        let is_place = finite(&emitter.middle) && finite(&emitter.turned_area);
+        let is_place = finite(&emitter.middle) && finite(&emitter.vector_area);
         let is_shape = is_place && finite(&[emitter.size]) && emitter.size > 0.0;
         let is_known = emitter.shape <= EmitterRecord::SPHERE && vertices(emitter);
         ensure((emitter.by_size as usize) < view.emitters.len(), "an emitter")?;
@@ -155,20 +155,20 @@ fn check_emitters(view: &View<'_>) -> Result<(), &'static str> {
     check_emitter_tree(view.emitter_nodes, view.emitters).map_err(|()| "the tree of emitters")
 }
 
-/// Whether nodes are a tree over these leaves in postfix order, so that walking it ends.
-fn check_solid_tree(nodes: &[NodeRecord], leaves: &[LeafRecord]) -> Result<(), ()> {
+/// Checks that nodes are a tree over these leaves in postfix order, so that walking it ends.
+fn check_solid_tree(nodes: &[SolidNodeRecord], leaves: &[LeafRecord]) -> Result<(), ()> {
     let ensure = |holds: bool| if holds { Ok(()) } else { Err(()) };
     ensure(nodes.last().is_some_and(|root| root.parent == NO_NODE))?;
     let mut owners = vec![NO_NODE; nodes.len()];
     let mut is_taken = vec![false; leaves.len()];
     for (index, node) in (0..).zip(nodes) {
-        if node.operation == LEAF {
+        if node.kind == SolidNodeKind::LEAF {
             let leaf = leaves.get(node.first_child as usize).ok_or(())?;
             let is_free = !std::mem::replace(&mut is_taken[node.first_child as usize], true);
             ensure(is_free && leaf.node == index)?;
             continue;
         }
-        ensure(node.operation < LEAF && node.operands >= 2)?;
+        ensure(node.kind.is_operation() && node.operands >= 2)?;
         let mut child = node.first_child;
         for operand in 0..node.operands {
             ensure(child < index && owners[child as usize] == NO_NODE)?;
@@ -182,7 +182,7 @@ fn check_solid_tree(nodes: &[NodeRecord], leaves: &[LeafRecord]) -> Result<(), (
     ensure(nodes.iter().zip(&owners).all(|(node, &owner)| node.parent == owner))
 }
 
-/// Whether nodes are such a tree over the emitters: every walk up or down ends.
+/// Checks that nodes are a tree over the emitters, parents first: every walk up or down ends.
 fn check_emitter_tree(nodes: &[EmitterNode], emitters: &[EmitterRecord]) -> Result<(), ()> {
     let ensure = |holds: bool| if holds { Ok(()) } else { Err(()) };
     ensure(nodes.len() == (2 * emitters.len()).saturating_sub(1))?;

@@ -143,7 +143,7 @@ impl Face {
                 } else {
                     of_plane(leaf.planes[self.part.face()])
                 };
-                if leaf.is_turned == 1 { -outward } else { outward }
+                if leaf.is_reversed == 1 { -outward } else { outward }
             }
         }
     }

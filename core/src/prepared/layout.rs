@@ -4,18 +4,18 @@ use super::{
     node::{Frame, Node},
     record::{
         Camera, CoplanarRecord, EmitterNode, EmitterRecord, Features, Item, LeafRecord,
-        LevelRecord, LightRecord, Lighting, MaterialRecord, NodeRecord, PlaneRecord,
-        QuadrangleRecord, SolidRecord, SphereRecord, Surface, TextureRecord, TexturedFace,
+        LevelRecord, LightRecord, Lighting, MaterialRecord, PlaneRecord, QuadrangleRecord,
+        SolidNodeRecord, SolidRecord, SphereRecord, Surface, TextureRecord, TexturedFace,
         TriangleRecord,
     },
 };
 
 pub(super) const MAGIC: [u8; 8] = *b"rtfarm\r\n";
 
-/// Changes with the layout or the meaning of any byte.
+/// The version changes with the layout or the meaning of any byte.
 pub(super) const VERSION: u32 = 6;
 
-/// Reads differently on a machine of the other byte order.
+/// This number reads differently on a machine of the other byte order.
 pub(super) const BYTE_ORDER: u32 = 0x0102_0304;
 
 #[derive(Debug, Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
@@ -24,13 +24,13 @@ pub(crate) struct Header {
     pub(super) magic: [u8; 8],
     pub(super) version: u32,
     pub(super) byte_order: u32,
-    /// BLAKE3 of everything behind this field, and the scene's address.
+    /// The BLAKE3 hash of all that comes after this field; it is the scene's address.
     pub(super) hash: [u8; 32],
     pub(super) sections: [Section; SECTIONS],
     pub(crate) camera: Camera,
     pub(crate) frame: Frame,
     pub(crate) lighting: Lighting,
-    /// Scene coordinates times this are the block's: a power of two.
+    /// Scene coordinates times this power of two are the block's coordinates.
     pub(crate) scale: f64,
     pub(crate) features: Features,
 }
@@ -40,9 +40,9 @@ pub(super) const HASHED_FROM: usize = 16 + 32;
 #[derive(Debug, Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
 #[repr(C)]
 pub(super) struct Section {
-    /// From the start of the block, in bytes.
+    /// The section begins so many bytes after the start of the block.
     pub(super) offset: u64,
-    /// Records.
+    /// It holds so many records.
     pub(super) count: u64,
 }
 
@@ -84,9 +84,9 @@ sections! {
     planes: PlaneRecord,
     materials: MaterialRecord,
     lights: LightRecord,
-    touches: Surface,
+    coincident: Surface,
     solids: SolidRecord,
-    solid_nodes: NodeRecord,
+    solid_nodes: SolidNodeRecord,
     leaves: LeafRecord,
     first_ranks: u32,
     emitters: EmitterRecord,
@@ -115,22 +115,24 @@ impl<'a> std::ops::Deref for View<'a> {
 }
 
 impl<'a> View<'a> {
-    /// The surfaces that contain the light.
+    /// The surfaces that the light lies on.
     #[inline(always)]
-    pub(crate) fn touches(&self, light: &LightRecord) -> &'a [Surface] {
-        let first = light.touches_first as usize;
-        &self.touches[first..first + light.touches_count as usize]
+    pub(crate) fn coincident_surfaces(&self, light: &LightRecord) -> &'a [Surface] {
+        let first = light.coincident_first as usize;
+        &self.coincident[first..first + light.coincident_count as usize]
     }
 
-    pub(crate) fn solid_nodes(&self, solid: &SolidRecord) -> &'a [NodeRecord] {
+    /// The nodes of a solid's tree; the last one is its root.
+    pub(crate) fn solid_nodes(&self, solid: &SolidRecord) -> &'a [SolidNodeRecord] {
         &self.sections.solid_nodes[solid.nodes()]
     }
 
+    /// The leaves of a solid.
     pub(crate) fn solid_leaves(&self, solid: &SolidRecord) -> &'a [LeafRecord] {
         &self.sections.leaves[solid.leaves()]
     }
 
-    /// The emitter of a rank.
+    /// The emitter that has a rank; `None` where that face is no emitter on record.
     pub(crate) fn emitter_of(&self, rank: u32) -> Option<u32> {
         self.emitters.binary_search_by_key(&rank, |emitter| emitter.rank).ok().map(|k| k as u32)
     }
@@ -143,6 +145,7 @@ impl<'a> View<'a> {
         }
     }
 
+    /// The positions of vertices.
     #[inline(always)]
     pub(crate) fn corners<const N: usize>(&self, vertices: &[u32; N]) -> [&'a [f64; 3]; N] {
         vertices.map(|vertex| &self.vertices[vertex as usize])

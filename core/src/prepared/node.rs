@@ -12,26 +12,36 @@ pub(crate) struct Node {
     /// min x, min y, min z, max x, max y, max z of the eight children; an unused child has
     /// min = ∞, max = -∞ and is never met.
     pub(crate) planes: [[f32; 8]; 6],
-    /// What is in each box.
+    /// These are in the boxes, in the same order.
     pub(crate) children: [Child; 8],
 }
 
 const _: () = assert!(size_of::<Node>() == 224);
 
-/// A node (bit 31 clear: its index, larger than its parent's), or a leaf (bit 31 set: how many
-/// items less one in 3 bits, then the first one's index).
+/// An inner node (bit 31 clear: its index, larger than its parent's), or a leaf (bit 31 set: how
+/// many items less one in 3 bits, then the first one's index).
+///
+/// The root has no parent, so its index never names a child: there it marks an unused place.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, bytemuck::Pod, bytemuck::Zeroable)]
 #[repr(transparent)]
-pub(crate) struct Child(pub(crate) u32);
+pub(crate) struct Child(u32);
 
 impl Child {
-    /// An unused child: the root's index, which no child can have.
-    pub(crate) const NONE: Self = Self(0);
+    /// A traversal starts with the root, which is nobody's child.
+    pub(crate) const ROOT: Self = Self::inner(Node::ROOT);
+    /// An unused place among the children of a node: the root's index, which no child has.
+    pub(crate) const NONE: Self = Self::inner(Node::ROOT);
     /// The most items in a leaf.
     pub(crate) const MOST_ITEMS: usize = 8;
     /// The limit of items in a hierarchy.
     pub(crate) const ITEM_LIMIT: usize = 1 << 28;
 
+    /// The node at this index, which is below 2^31.
+    pub(crate) const fn inner(index: usize) -> Self {
+        Self(index as u32)
+    }
+
+    /// A leaf of `count` items, at most [`Child::MOST_ITEMS`], from `first` on.
     pub(crate) fn leaf(first: usize, count: usize) -> Self {
         debug_assert!(first < Self::ITEM_LIMIT && (1..=Self::MOST_ITEMS).contains(&count));
         Self(1 << 31 | (count as u32 - 1) << 28 | first as u32)
@@ -54,9 +64,18 @@ impl Child {
     pub(crate) fn node(self) -> usize {
         self.0 as usize
     }
+
+    /// The same child where its node's subtree begins `offset` nodes further on. Leaves and unused
+    /// places stay as they are.
+    pub(crate) fn moved_by(self, offset: usize) -> Self {
+        if self == Self::NONE || self.is_leaf() { self } else { Self(self.0 + offset as u32) }
+    }
 }
 
 impl Node {
+    /// The index of the node that all others descend from.
+    pub(crate) const ROOT: usize = 0;
+
     /// A node without children.
     pub(crate) const EMPTY: Self = {
         let (low, high) = ([f32::INFINITY; 8], [f32::NEG_INFINITY; 8]);
@@ -64,7 +83,7 @@ impl Node {
     };
 }
 
-/// The frame that boxes are kept in: box coordinate = (scene coordinate - origin) · scale, where
+/// Boxes are kept in this frame: box coordinate = (scene coordinate - origin) · scale, where
 /// scale is a power of two that brings the scene's extent into 0.5..=1.
 #[derive(Debug, Clone, Copy, PartialEq, bytemuck::Pod, bytemuck::Zeroable)]
 #[repr(C)]

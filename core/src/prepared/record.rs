@@ -6,7 +6,7 @@ use glam::DVec3;
 
 use crate::{exact::float::power_of_two_below_inverse, left_out, transfer::Transfer};
 
-/// What the scene needs of the tracer; 1 or 0 each.
+/// The features of the tracer that the scene needs; each is 1 or 0.
 #[derive(Debug, Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
 #[repr(C)]
 pub(crate) struct Features {
@@ -18,7 +18,7 @@ pub(crate) struct Features {
     pub(crate) has_clear_shadows: u32,
     /// There are constructive solids.
     pub(crate) has_solids: u32,
-    /// Faces send light on to others: [`Features::AIMED`] or [`Features::UNAIMED`].
+    /// Faces send light on to others.
     pub(crate) has_emitters: u32,
     /// A face shows an image.
     pub(crate) has_textures: u32,
@@ -28,11 +28,6 @@ pub(crate) struct Features {
 }
 
 impl Features {
-    /// Light is looked for where emitters are, as well as all over the sky.
-    pub(crate) const AIMED: u32 = 1;
-    /// Only all over the sky, by one ray from each place: the yardstick.
-    pub(crate) const UNAIMED: u32 = 2;
-
     pub(crate) fn has_branches(&self) -> bool {
         self.has_branches == 1
     }
@@ -42,7 +37,7 @@ impl Features {
     }
 
     pub(crate) fn has_emitters(&self) -> bool {
-        self.has_emitters != 0 && !left_out::SECONDARY_LIGHT
+        self.has_emitters == 1 && !left_out::SECONDARY_LIGHT
     }
 
     pub(crate) fn has_textures(&self) -> bool {
@@ -63,7 +58,7 @@ pub(crate) struct Lighting {
 }
 
 impl Lighting {
-    /// What a surface receives before any lamp is asked.
+    /// The light that a surface receives before any lamp is asked.
     pub(crate) fn ambient(&self) -> DVec3 {
         if left_out::AMBIENT { DVec3::ZERO } else { DVec3::from_array(self.ambient) }
     }
@@ -75,15 +70,16 @@ impl Lighting {
 #[repr(C)]
 pub(crate) struct Camera {
     pub(crate) eye: [f64; 3],
-    /// From the eye to the screen's top left corner.
+    /// This vector leads from the eye to the screen's top left corner.
     pub(crate) top_left: [f64; 3],
-    /// From the top left corner to the top right one.
+    /// This vector leads from the top left corner to the top right one.
     pub(crate) right: [f64; 3],
-    /// From the top left corner to the bottom left one.
+    /// This vector leads from the top left corner to the bottom left one.
     pub(crate) down: [f64; 3],
 }
 
 impl Camera {
+    /// The same camera with a screen whose largest coordinate is in 0.5..1.
     pub(super) fn with_screen_of_one(self) -> Self {
         let screen = [self.top_left, self.right, self.down].map(DVec3::from_array);
         let largest =
@@ -157,6 +153,7 @@ impl Item {
     }
 }
 
+/// A triangle that is alone in its plane.
 #[derive(Debug, Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
 #[repr(C)]
 pub(crate) struct TriangleRecord {
@@ -165,6 +162,7 @@ pub(crate) struct TriangleRecord {
     pub(crate) rank: u32,
 }
 
+/// A triangle that shares its plane with other faces.
 #[derive(Debug, Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
 #[repr(C)]
 pub(crate) struct CoplanarRecord {
@@ -174,6 +172,7 @@ pub(crate) struct CoplanarRecord {
     pub(crate) plane: PlaneIndex,
 }
 
+/// A quadrangle. Its plane is recorded even where no other face shares it.
 #[derive(Debug, Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
 #[repr(C)]
 pub(crate) struct QuadrangleRecord {
@@ -190,6 +189,7 @@ impl QuadrangleRecord {
     }
 }
 
+/// A sphere that is no part of a solid.
 #[derive(Debug, Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
 #[repr(C)]
 pub(crate) struct SphereRecord {
@@ -197,12 +197,13 @@ pub(crate) struct SphereRecord {
     pub(crate) radius: f64,
     pub(crate) material: u32,
     pub(crate) rank: u32,
-    /// Equal spheres have one surface.
+    /// Equal spheres have one surface: the rank of one of them.
     pub(crate) surface: u32,
     padding: u32,
 }
 
 impl SphereRecord {
+    /// A sphere with a surface of its own.
     pub(crate) fn new(center: DVec3, radius: f64, material: u32, rank: u32) -> Self {
         Self { center: center.to_array(), radius, material, rank, surface: rank, padding: 0 }
     }
@@ -221,6 +222,7 @@ pub(crate) struct SolidRecord {
 }
 
 impl SolidRecord {
+    /// A solid with a run of nodes, a run of leaves and the rank of its first face.
     pub(crate) fn new(nodes: Range<usize>, leaves: Range<usize>, rank: u32) -> Self {
         Self {
             first_node: nodes.start as u32,
@@ -231,41 +233,55 @@ impl SolidRecord {
         }
     }
 
+    /// The run of its nodes.
     pub(crate) fn nodes(&self) -> Range<usize> {
         self.first_node as usize..self.first_node as usize + self.node_count as usize
     }
 
+    /// The run of its leaves.
     pub(crate) fn leaves(&self) -> Range<usize> {
         self.first_leaf as usize..self.first_leaf as usize + self.leaf_count as usize
     }
 }
 
-/// What joins a node's operands.
-pub(crate) const UNION: u32 = 0;
+/// The kind of a node in a solid's tree: a leaf, or the operation that joins its operands. Numbers
+/// that name no kind are refused when a block is opened.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, bytemuck::Pod, bytemuck::Zeroable)]
+#[repr(transparent)]
+pub(crate) struct SolidNodeKind(u32);
 
-pub(crate) const INTERSECTION: u32 = 1;
+impl SolidNodeKind {
+    /// What is in any operand.
+    pub(crate) const UNION: Self = Self(0);
+    /// What is in all operands.
+    pub(crate) const INTERSECTION: Self = Self(1);
+    /// What is in the first operand and in no other.
+    pub(crate) const DIFFERENCE: Self = Self(2);
+    /// A leaf has no operands; its `first_child` is its number among the solid's leaves.
+    pub(crate) const LEAF: Self = Self(3);
 
-pub(crate) const DIFFERENCE: u32 = 2;
+    /// Whether it is one of the operations.
+    pub(crate) fn is_operation(self) -> bool {
+        matches!(self, Self::UNION | Self::INTERSECTION | Self::DIFFERENCE)
+    }
+}
 
-/// A node that is a leaf; `first_child` is its number among the solid's leaves.
-pub(crate) const LEAF: u32 = 3;
-
-/// No such node.
+/// The index that stands where there is no node.
 pub(crate) const NO_NODE: u32 = u32::MAX;
 
 /// A node of a solid's tree. Indices count from the solid's first node; children stand before
 /// their parents.
 #[derive(Debug, Clone, Copy, PartialEq, bytemuck::Pod, bytemuck::Zeroable)]
 #[repr(C)]
-pub(crate) struct NodeRecord {
-    pub(crate) operation: u32,
+pub(crate) struct SolidNodeRecord {
+    pub(crate) kind: SolidNodeKind,
     pub(crate) parent: u32,
     pub(crate) first_child: u32,
-    /// The parent's next operand.
+    /// The parent's next operand, or [`NO_NODE`].
     pub(crate) next: u32,
-    /// How many operands.
+    /// An operation has so many operands; a leaf has none.
     pub(crate) operands: u32,
-    /// 1 for the operand of a difference that the others are taken from.
+    /// 1 for the parent's first operand, from which a difference takes the others.
     pub(crate) is_first: u32,
 }
 
@@ -274,29 +290,21 @@ pub(crate) struct NodeRecord {
 #[repr(C)]
 pub(crate) struct LeafRecord {
     pub(crate) center: [f64; 3],
-    /// 0 for a parallelepiped.
+    /// The radius of a sphere is above 0; a parallelepiped has 0.
     pub(crate) radius: f64,
-    /// Of a parallelepiped; they look outward.
+    /// The planes of a parallelepiped's faces, which look outward; a sphere has none.
     pub(crate) planes: [PlaneIndex; 6],
     pub(crate) material: u32,
     /// Its node in the solid's tree.
     pub(crate) node: u32,
-    /// 1 when it is taken away: its faces look inward.
-    pub(crate) is_turned: u32,
-    /// Of a sphere.
+    /// 1 where an odd number of differences takes it away, so that its faces look inward.
+    pub(crate) is_reversed: u32,
+    /// Equal spheres have one surface, within solids or without. That of a parallelepiped means
+    /// nothing: its faces have the surfaces of their planes.
     pub(crate) surface: u32,
 }
 
 impl LeafRecord {
-    pub(crate) fn sphere(center: DVec3, radius: f64, material: u32, node: u32) -> Self {
-        Self { center: center.to_array(), radius, ..Self::parallelepiped(material, node) }
-    }
-
-    pub(crate) fn parallelepiped(material: u32, node: u32) -> Self {
-        let planes = [PlaneIndex(0); 6];
-        Self { center: [0.0; 3], radius: 0.0, planes, material, node, is_turned: 0, surface: 0 }
-    }
-
     #[inline(always)]
     pub(crate) fn is_sphere(&self) -> bool {
         self.radius > 0.0
@@ -314,7 +322,7 @@ impl LeafRecord {
 #[repr(C)]
 pub(crate) struct PlaneRecord {
     pub(crate) point: [f64; 3],
-    /// Of length 1.
+    /// The normal has length 1.
     pub(crate) normal: [f64; 3],
 }
 
@@ -324,10 +332,12 @@ pub(crate) struct PlaneRecord {
 pub(crate) struct PlaneIndex(u32);
 
 impl PlaneIndex {
-    pub(crate) fn new(index: usize, is_turned: bool) -> Self {
-        Self(index as u32 | u32::from(is_turned) << 31)
+    /// The plane at an index, below 2^31, for a face that may look the other way.
+    pub(crate) fn new(index: usize, is_reversed: bool) -> Self {
+        Self(index as u32 | u32::from(is_reversed) << 31)
     }
 
+    /// The index of the plane's record.
     #[inline(always)]
     pub(crate) fn index(self) -> usize {
         (self.0 & !(1 << 31)) as usize
@@ -345,6 +355,7 @@ impl PlaneIndex {
     }
 }
 
+/// A material.
 #[derive(Debug, Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
 #[repr(C)]
 pub(crate) struct MaterialRecord {
@@ -361,7 +372,7 @@ pub(crate) struct MaterialRecord {
 }
 
 impl MaterialRecord {
-    /// No texture.
+    /// The texture of a material without one.
     pub(crate) const PLAIN: u32 = u32::MAX;
 
     pub(crate) fn new(color: DVec3, [reflect, alpha, refract]: [f64; 3], texture: u32) -> Self {
@@ -373,29 +384,32 @@ impl MaterialRecord {
         self.reflect * self.alpha * DVec3::from_array(self.color).max_element() > 0.0
     }
 
-    /// What a shadow ray keeps when it crosses a face.
-    pub(crate) fn clearness(&self) -> f64 {
+    /// The share of its light that a shadow ray keeps when it crosses a face.
+    pub(crate) fn transmittance(&self) -> f64 {
         (1.0 - self.alpha) * (1.0 - self.reflect)
     }
 }
 
+/// A point light.
 #[derive(Debug, Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
 #[repr(C)]
 pub(crate) struct LightRecord {
     pub(crate) position: [f64; 3],
     pub(crate) intensity: [f64; 3],
-    /// The faces that contain the light: a run of `touches`.
-    pub(super) touches_first: u32,
-    pub(super) touches_count: u32,
+    /// The surfaces that the light lies on are a run of the section `coincident`; it begins here.
+    pub(super) coincident_first: u32,
+    /// That run has so many surfaces.
+    pub(super) coincident_count: u32,
 }
 
 impl LightRecord {
-    pub(crate) fn new(position: DVec3, intensity: DVec3, first: u32, count: u32) -> Self {
+    /// A light that lies on a run of the section `coincident`.
+    pub(crate) fn new(position: DVec3, intensity: DVec3, coincident: Range<usize>) -> Self {
         Self {
             position: position.to_array(),
             intensity: intensity.to_array(),
-            touches_first: first,
-            touches_count: count,
+            coincident_first: coincident.start as u32,
+            coincident_count: coincident.len() as u32,
         }
     }
 }
@@ -406,22 +420,21 @@ impl LightRecord {
 pub(crate) struct EmitterRecord {
     /// The centre of a sphere, the mean of a polygon's corners.
     pub(crate) middle: [f64; 3],
-    /// Of a polygon: its normal times its area.
-    pub(crate) turned_area: [f64; 3],
-    /// The radius, or the area. Above 0.
+    /// The normal of a polygon times its area; 0 for a sphere.
+    pub(crate) vector_area: [f64; 3],
+    /// The radius of a sphere or the area of a polygon, above 0.
     pub(crate) size: f64,
-    /// About what each side sends on at most, in its brightest channel; of a polygon the side that
-    /// `turned_area` leads to first.
+    /// Each side sends on about this at most, in its brightest channel. The first side of a polygon
+    /// is the one that `vector_area` leads to.
     pub(crate) radiosity: [f64; 2],
-    /// Of a polygon: the diagonal from the first to the third lies inside; the third of a triangle
-    /// stands there twice.
+    /// The corners of a polygon: the diagonal from the first to the third lies inside, and the
+    /// third of a triangle stands there twice. Those of a sphere mean nothing.
     pub(crate) vertices: [u32; 4],
     pub(crate) rank: u32,
     pub(crate) shape: u32,
-    /// Its leaf in the tree.
+    /// Its leaf in the tree over all emitters.
     pub(crate) node: u32,
-    /// Of the record that stands at the same place in the order of sizes, the largest first: its
-    /// index.
+    /// The k-th record holds here the index of the k-th largest emitter.
     pub(crate) by_size: u32,
 }
 
@@ -445,22 +458,25 @@ impl EmitterRecord {
 #[derive(Debug, Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
 #[repr(C)]
 pub(crate) struct EmitterNode {
-    /// Of a ball around its emitters.
+    /// The centre of a sphere around its emitters.
     pub(crate) center: [f64; 3],
+    /// The radius of that sphere.
     pub(crate) radius: f64,
-    /// About the share of that ball's disc that they fill. 0..=1.
+    /// The emitters fill about this share of that sphere's disc: 0..=1.
     pub(crate) fill: f64,
-    /// What they send on, by their areas.
+    /// The mean of what they send on, weighted by their areas.
     pub(crate) radiosity: f64,
+    /// The parent, or [`NO_NODE`] for the root.
     pub(crate) parent: u32,
-    /// The first of two, side by side; not of a leaf.
+    /// The first of two children, which stand side by side; [`NO_NODE`] for a leaf.
     pub(crate) child: u32,
-    /// Of a leaf.
+    /// The emitter of a leaf; that of an inner node means nothing.
     pub(crate) emitter: u32,
     pub(crate) padding: u32,
 }
 
 impl EmitterNode {
+    /// The leaf of an emitter.
     pub(crate) fn leaf(parent: u32, emitter: u32) -> Self {
         let child = NO_NODE;
         Self { parent, child, emitter, ..bytemuck::Zeroable::zeroed() }
@@ -482,6 +498,7 @@ pub(crate) struct TexturedFace {
 }
 
 impl TexturedFace {
+    /// The texture coordinates of the face with a rank.
     pub(crate) fn new(rank: u32, texcoords: Texcoords) -> Self {
         Self { texcoords, rank, padding: 0 }
     }
@@ -498,7 +515,7 @@ pub(crate) struct Texcoords(pub(crate) [[f64; 2]; 4]);
 #[repr(C)]
 pub(crate) struct TextureRecord {
     pub(crate) first_level: u32,
-    /// At least 1.
+    /// There is at least one level.
     pub(crate) level_count: u32,
 }
 
@@ -508,12 +525,13 @@ pub(crate) struct TextureRecord {
 pub(crate) struct LevelRecord {
     pub(crate) width: u32,
     pub(crate) height: u32,
-    /// Of its first texel: of an image's first level among the fine ones, else among the coarse
-    /// ones.
+    /// The place of its first texel: among the fine texels for an image's first level, among the
+    /// coarse ones for all others.
     pub(crate) offset: u64,
 }
 
 impl TextureRecord {
+    /// The run of its levels.
     pub(crate) fn levels(self) -> Range<usize> {
         self.first_level as usize..self.first_level as usize + self.level_count as usize
     }

@@ -16,8 +16,7 @@ use crate::prepared::{
     face::Part,
     layout::View,
     record::{
-        DIFFERENCE, INTERSECTION, LEAF, LeafRecord, NO_NODE, NodeRecord, PlaneIndex, SolidRecord,
-        Surface, UNION,
+        LeafRecord, NO_NODE, PlaneIndex, SolidNodeKind, SolidNodeRecord, SolidRecord, Surface,
     },
 };
 
@@ -122,7 +121,7 @@ impl Scratch {
     }
 
     /// The ray crosses a leaf: what that changes up to the root.
-    fn flip(&mut self, nodes: &[NodeRecord], leaf: u32) {
+    fn flip(&mut self, nodes: &[SolidNodeRecord], leaf: u32) {
         let mut node = leaf as usize;
         loop {
             if self.flipped[node] != self.crossing {
@@ -131,21 +130,21 @@ impl Scratch {
             }
             let is_inside = !self.inside[node];
             self.inside[node] = is_inside;
-            let NodeRecord { parent, is_first, .. } = nodes[node];
+            let SolidNodeRecord { parent, is_first, .. } = nodes[node];
             if parent == NO_NODE {
                 return;
             }
             let parent = parent as usize;
             let record = &nodes[parent];
-            let is_minuend = record.operation == DIFFERENCE && is_first == 1;
+            let is_minuend = record.kind == SolidNodeKind::DIFFERENCE && is_first == 1;
             if !is_minuend {
                 let count = &mut self.counts[parent];
                 *count = if is_inside { *count + 1 } else { *count - 1 };
             }
             let count = self.counts[parent];
-            let result = match record.operation {
-                UNION => count > 0,
-                INTERSECTION => count == record.operands,
+            let result = match record.kind {
+                SolidNodeKind::UNION => count > 0,
+                SolidNodeKind::INTERSECTION => count == record.operands,
                 _ => self.inside[record.first_child as usize] && count == 0,
             };
             if result == self.inside[parent] {
@@ -162,11 +161,11 @@ impl Scratch {
 
     /// The leaf whose face is the solid's surface where the root has changed: at each operation
     /// the first operand in file order that made it change.
-    fn responsible(&self, nodes: &[NodeRecord]) -> u32 {
+    fn responsible(&self, nodes: &[SolidNodeRecord]) -> u32 {
         let mut node = nodes.len() - 1;
         let mut enters = self.inside[node];
-        while nodes[node].operation != LEAF {
-            let takes_away = nodes[node].operation == DIFFERENCE;
+        while nodes[node].kind != SolidNodeKind::LEAF {
+            let takes_away = nodes[node].kind == SolidNodeKind::DIFFERENCE;
             let mut child = nodes[node].first_child;
             loop {
                 let is_first = nodes[child as usize].is_first == 1;

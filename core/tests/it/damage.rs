@@ -89,11 +89,12 @@ fn is_taken(block: &[u8], what: &str) -> bool {
         Err(PreparedError::Malformed(_)) => return false,
         Err(other) => panic!("{what}: {other}"),
     };
-    let quality = Quality { sampling: Sampling::Fixed(2), ..Quality::default() };
+    let quality = Quality { sampling: Sampling::fixed(2).unwrap(), ..Quality::default() };
     let settings = Settings { size: Size::new(12, 7).unwrap(), quality };
     let go_on = &mut || ControlFlow::Continue(());
     let picture =
-        render_tile(&scene, &settings, whole(settings.size), Isa::fastest(), go_on).unwrap();
+        render_tile(&scene, &settings.quality, whole(settings.size), Isa::fastest(), go_on)
+            .unwrap();
     assert_eq!(picture.pixels.len(), 12 * 7);
     for pixel in picture.pixels.as_flattened() {
         assert!((0.0..BRIGHTEST).contains(pixel), "{what}: a pixel is {pixel}");

@@ -8,7 +8,7 @@ use rtfarm_core::{
     prepare::prepare,
     prepared::{PreparedBytes, PreparedScene},
     scene::{Operation, Parallelepiped, Quadrangle, Scene, Solid, SolidNode, Triangle},
-    trace::Probe,
+    testing::{Probe, Probing},
 };
 use rtfarm_oracle::{
     Oracle,

@@ -26,7 +26,7 @@ fn render(
     let settings =
         Settings { size: known.size, quality: Quality { sampling, seed, ..Quality::default() } };
     let go_on = &mut || ControlFlow::Continue(());
-    render_tile(scene, &settings, whole(known.size), Isa::fastest(), go_on).unwrap()
+    render_tile(scene, &settings.quality, whole(known.size), Isa::fastest(), go_on).unwrap()
 }
 
 /// The true mean square error, over all channels.
@@ -38,7 +38,7 @@ fn square_error(rendered: &RenderedTile, known: &KnownPicture) -> f64 {
 }
 
 fn adaptive(steps: f64) -> Sampling {
-    Sampling::Adaptive { error: steps / 255.0, most: 256 }
+    Sampling::adaptive(steps / 255.0, 256).unwrap()
 }
 
 /// Told over true error for every scene, sampling and seed.
@@ -68,7 +68,7 @@ fn check_calibration(samplings: &[Sampling]) {
 
 #[test]
 fn fixed_samples_tell_their_error() {
-    check_calibration(&[8, 11, 16, 64, 256].map(Sampling::Fixed));
+    check_calibration(&[8, 11, 16, 64, 256].map(|count| Sampling::fixed(count).unwrap()));
 }
 
 #[test]
@@ -80,7 +80,8 @@ fn adaptive_samples_tell_their_error() {
 /// powers of two by the slope of the errors.
 fn fixed_samples_for(known: &KnownPicture, square: f64) -> f64 {
     let scene = prepared(&known.scene);
-    let square_of = |count| square_error(&render(&scene, known, Sampling::Fixed(count), 3), known);
+    let square_of =
+        |count| square_error(&render(&scene, known, Sampling::fixed(count).unwrap(), 3), known);
     let (mut count, mut before) = (8, square_of(8));
     loop {
         let after = square_of(2 * count);
@@ -139,7 +140,7 @@ fn missing_light(width: f64) -> [f64; 2] {
     let known = KnownPicture { name: "wires", scene, size, truth: Vec::new() };
     let scene = prepared(&known.scene);
     let truth = 22.0 * 2.8 * width * PIXEL / (PIXEL * PIXEL);
-    [adaptive(1.0), Sampling::Fixed(64)].map(|sampling| {
+    [adaptive(1.0), Sampling::fixed(64).unwrap()].map(|sampling| {
         let pixels = render(&scene, &known, sampling, 1).pixels;
         1.0 - pixels.iter().map(|pixel| f64::from(pixel[0])).sum::<f64>() / truth
     })

@@ -9,7 +9,8 @@ use rtfarm_core::{
     isa::Isa,
     prepared::{PreparedBytes, PreparedScene},
     scene::{Quadrangle, Scene, Sphere},
-    trace::Probe,
+    testing::{Probe, Probing},
+    tile::Area,
 };
 use rtfarm_oracle::{
     Oracle,
@@ -542,13 +543,10 @@ fn pictures_may_be_one_pixel_or_as_wide_as_can_be() {
         let red = seen.iter().filter(|pixel| pixel[0] == 1.0).count();
         // The middle half; the middles of no pixels lie on its border.
         assert_eq!(red, 32_767, "{width} x {height}");
-        let corner = rtfarm_core::tile::Area {
-            x0: width as u32 - 1,
-            y0: height as u32 - 1,
-            width: 1,
-            height: 1,
-        };
-        let last = pixels(&prepared(&scene), &settings(width, height, 1), corner);
+        let settings = settings(width, height, 1);
+        let corner = [width as u32 - 1, height as u32 - 1];
+        let corner = Area::new(settings.size, corner, [1, 1]).unwrap();
+        let last = pixels(&prepared(&scene), &settings, corner);
         assert_eq!(last, [BLACK]);
     }
     HardCase::ExtremePictureSizes
@@ -628,7 +626,7 @@ fn starts_on(ball: &Ball, random: &mut Random, count: usize, ahead: f64) -> Vec<
         })
         .collect();
     let hits = ball.block.probe(&outside, Isa::fastest());
-    let start = |(probe, hit): (&Probe, Option<rtfarm_core::trace::ProbeHit>)| {
+    let start = |(probe, hit): (&Probe, Option<rtfarm_core::testing::ProbeHit>)| {
         let hit = hit.expect("a ray at the middle of a ball");
         let origin = probe.origin + hit.t * probe.direction;
         let outward = (origin - ball.center).normalize();

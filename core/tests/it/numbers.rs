@@ -10,7 +10,7 @@ use rtfarm_core::{
     prepared::{PreparedBytes, PreparedScene},
     render::{Settings, render_tile},
     scene::{Quadrangle, Scene, Sphere, Triangle},
-    trace::{Probe, ProbeHit},
+    testing::{Probe, ProbeHit, Probing},
 };
 use rtfarm_oracle::{
     Oracle,
@@ -509,7 +509,7 @@ fn numbers_next_to_zero_change_nothing() {
         for isa in Isa::ALL.into_iter().filter(|isa| isa.is_supported()) {
             let go_on = &mut || std::ops::ControlFlow::Continue(());
             let area = whole(settings.size);
-            let tile = render_tile(&opened(&changed), &settings, area, isa, go_on).unwrap();
+            let tile = render_tile(&opened(&changed), &settings.quality, area, isa, go_on).unwrap();
             assert!(tile.pixels == plain, "{k}, {isa}");
             count += tile.pixels.len();
         }
@@ -809,7 +809,8 @@ fn pictures_do_not_depend_on_instructions_or_threads() {
             let picture = |isa| {
                 let go_on = &mut || std::ops::ControlFlow::Continue(());
                 let area = whole(settings.size);
-                let tile = render_tile(&block, &settings, area, isa, go_on).expect("nobody stops");
+                let tile =
+                    render_tile(&block, &settings.quality, area, isa, go_on).expect("nobody stops");
                 tile.pixels.into_iter().flatten().map(f32::to_bits).collect::<Vec<_>>()
             };
             let scalar = picture(Isa::Scalar);

@@ -47,7 +47,8 @@ fn pane(z: f64, half: f64, to_eye: bool, material: &str) -> String {
 fn rendered(scene: &Scene, side: u64) -> RenderedTile {
     let settings = settings(side, side, 1);
     let go_on = &mut || ControlFlow::Continue(());
-    render_tile(&prepared(scene), &settings, whole(settings.size), Isa::fastest(), go_on).unwrap()
+    render_tile(&prepared(scene), &settings.quality, whole(settings.size), Isa::fastest(), go_on)
+        .unwrap()
 }
 
 fn side() -> u64 {

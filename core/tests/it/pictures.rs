@@ -29,6 +29,7 @@ const ROUNDING: f64 = 1e-6;
 
 fn positions(settings: &Settings, x: u32, y: u32) -> Vec<(f64, f64)> {
     let Sampling::Fixed(count) = settings.quality.sampling else { panic!("fixed sampling") };
+    let count = count.get();
     let samples = Samples::new(count, settings.quality.seed, x, y);
     (0..count).map(|k| samples.sample(k).position().into()).collect()
 }
@@ -319,9 +320,9 @@ fn check_areas(
 ) {
     let picture = bits(&pixels(scene, settings, whole(settings.size)));
     for area in areas {
-        let rows = (area.y0..area.y0 + area.height).flat_map(|y| {
-            let start = (y * settings.size.width() + area.x0) as usize;
-            picture[start..start + area.width as usize].iter().copied()
+        let rows = area.rows().flat_map(|y| {
+            let start = (y * settings.size.width() + area.x0()) as usize;
+            picture[start..start + area.width() as usize].iter().copied()
         });
         assert!(bits(&pixels(scene, settings, area)).into_iter().eq(rows), "{area:?}");
     }
@@ -331,13 +332,14 @@ fn check_areas(
 fn the_picture_does_not_depend_on_how_it_is_cut() {
     let scene = prepared(&crowded(Style::Plain));
     let mut random = Random::new(1);
-    let samplings = [Sampling::Adaptive { error: 0.02, most: 64 }].into_iter();
-    for sampling in samplings.chain([1, 5, 16].map(Sampling::Fixed)) {
+    let fixed = [1, 5, 16].map(|count| Sampling::fixed(count).unwrap());
+    for sampling in fixed.into_iter().chain(Sampling::adaptive(0.02, 64)) {
         let mut settings = settings(71, 43, 1);
         settings.quality.sampling = sampling;
         let (width, height) = (settings.size.width(), settings.size.height());
-        let row = |y0| Area { x0: 0, y0, width, height: 1 };
-        let column = |x0| Area { x0, y0: 0, width: 1, height };
+        let area = |start, sides| Area::new(settings.size, start, sides).unwrap();
+        let row = |y0| area([0, y0], [width, 1]);
+        let column = |x0| area([x0, 0], [1, height]);
         check_areas(&scene, &settings, (0..height).map(row));
         check_areas(&scene, &settings, (0..width).map(column));
         let areas = (0..40).map(|_| {
@@ -346,7 +348,7 @@ fn the_picture_does_not_depend_on_how_it_is_cut() {
                 (start, 1 + random.below((length - start) as usize) as u32)
             };
             let ((x0, width), (y0, height)) = (side(width), side(height));
-            Area { x0, y0, width, height }
+            area([x0, y0], [width, height])
         });
         check_areas(&scene, &settings, areas);
     }

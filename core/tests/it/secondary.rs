@@ -7,7 +7,7 @@ use glam::DVec3;
 use rayon::prelude::*;
 use rtfarm_core::{
     isa::Isa,
-    render::{Quality, RenderedTile, Sampling, Settings, render_tile},
+    render::{Cutoff, Quality, RenderedTile, Sampling, Settings, render_tile},
     scene::{Scene, Texture},
     tile::{Area, Size},
 };
@@ -65,15 +65,21 @@ fn polygon(corners: &[DVec3], material: &str) -> String {
 }
 
 fn settings(side: u64, samples: u32, secondary: bool) -> Settings {
-    let sampling = Sampling::Fixed(samples);
+    let sampling = Sampling::fixed(samples).unwrap();
     // With a cut-off of 1 nothing is seen in mirrors.
-    let quality = Quality { sampling, seed: 5, secondary, cutoff: 1.0, ..Quality::default() };
+    let quality = Quality {
+        sampling,
+        seed: 5,
+        secondary,
+        cutoff: Cutoff::new(1.0).unwrap(),
+        ..Quality::default()
+    };
     Settings { size: Size::new(side, side).unwrap(), quality }
 }
 
 fn rendered(scene: &Scene, settings: &Settings, isa: Isa) -> RenderedTile {
     let go_on = &mut || ControlFlow::Continue(());
-    render_tile(&prepared(scene), settings, whole(settings.size), isa, go_on).unwrap()
+    render_tile(&prepared(scene), &settings.quality, whole(settings.size), isa, go_on).unwrap()
 }
 
 /// The mean of numbers that estimate one, and its standard error.
@@ -389,8 +395,14 @@ fn medley(seed: u64) -> Scene {
 /// Settings under which a pixel's one sample is its middle, and nothing is seen in mirrors of
 /// mirrors.
 fn middles(size: Size, seed: u64, secondary: bool) -> Settings {
-    let sampling = Sampling::Fixed(1);
-    let quality = Quality { sampling, seed, secondary, cutoff: 0.1, ..Quality::default() };
+    let sampling = Sampling::fixed(1).unwrap();
+    let quality = Quality {
+        sampling,
+        seed,
+        secondary,
+        cutoff: Cutoff::new(0.1).unwrap(),
+        ..Quality::default()
+    };
     Settings { size, quality }
 }
 
@@ -407,7 +419,9 @@ fn check_against_oracle(what: &str, scene: &Scene, size: Size, side: u32, seeds:
         .map(|seed| {
             let go_on = &mut || ControlFlow::Continue(());
             let settings = middles(size, seed, true);
-            render_tile(&block, &settings, whole(size), Isa::fastest(), go_on).unwrap().pixels
+            render_tile(&block, &settings.quality, whole(size), Isa::fastest(), go_on)
+                .unwrap()
+                .pixels
         })
         .collect();
     let middle = |_, _| vec![(0.5, 0.5)];
@@ -560,7 +574,7 @@ fn bits(pixels: &[[f32; 3]]) -> Vec<[u32; 3]> {
 #[test]
 fn a_pixel_is_the_same_on_every_machine_and_in_every_tile() {
     let scene = crowd();
-    let quality = Quality { sampling: Sampling::Fixed(9), ..Quality::default() };
+    let quality = Quality { sampling: Sampling::fixed(9).unwrap(), ..Quality::default() };
     let settings = Settings { size: Size::new(47, 35).unwrap(), quality };
     let whole_picture = rendered(&scene, &settings, Isa::Scalar);
     for isa in Isa::ALL.into_iter().filter(|isa| isa.is_supported()) {
@@ -570,15 +584,15 @@ fn a_pixel_is_the_same_on_every_machine_and_in_every_tile() {
     }
     let block = prepared(&scene);
     for area in [
-        Area { x0: 0, y0: 0, width: 1, height: 35 },
-        Area { x0: 13, y0: 7, width: 20, height: 9 },
-        Area { x0: 46, y0: 34, width: 1, height: 1 },
+        Area::new(settings.size, [0, 0], [1, 35]).unwrap(),
+        Area::new(settings.size, [13, 7], [20, 9]).unwrap(),
+        Area::new(settings.size, [46, 34], [1, 1]).unwrap(),
     ] {
         let go_on = &mut || ControlFlow::Continue(());
-        let tile = render_tile(&block, &settings, area, Isa::fastest(), go_on).unwrap();
-        let rows = (area.y0..area.y0 + area.height).flat_map(|y| {
-            let start = (y * 47 + area.x0) as usize;
-            whole_picture.pixels[start..start + area.width as usize].iter().copied()
+        let tile = render_tile(&block, &settings.quality, area, Isa::fastest(), go_on).unwrap();
+        let rows = area.rows().flat_map(|y| {
+            let start = (y * 47 + area.x0()) as usize;
+            whole_picture.pixels[start..start + area.width() as usize].iter().copied()
         });
         assert!(bits(&tile.pixels) == bits(&rows.collect::<Vec<_>>()), "{area:?}");
     }
@@ -587,7 +601,7 @@ fn a_pixel_is_the_same_on_every_machine_and_in_every_tile() {
 #[test]
 fn a_scaled_scene_gathers_the_same_light_to_the_bit() {
     let scene = crowd();
-    let quality = Quality { sampling: Sampling::Fixed(2), ..Quality::default() };
+    let quality = Quality { sampling: Sampling::fixed(2).unwrap(), ..Quality::default() };
     let settings = Settings { size: Size::new(40, 30).unwrap(), quality };
     let picture = rendered(&scene, &settings, Isa::fastest()).pixels;
     for factor in [2_f64.powi(-40), 2_f64.powi(40)] {
@@ -632,8 +646,11 @@ fn a_scaled_scene_gathers_the_same_light_to_the_bit() {
 fn one_bounce_is_no_more_than_the_brightest_face_sends_on() {
     let scene = crowd();
     let settings = |secondary| {
-        let quality =
-            Quality { sampling: Sampling::Fixed(64), secondary, ..settings(1, 1, true).quality };
+        let quality = Quality {
+            sampling: Sampling::fixed(64).unwrap(),
+            secondary,
+            ..settings(1, 1, true).quality
+        };
         Settings { size: Size::new(64, 48).unwrap(), quality }
     };
     let with = rendered(&scene, &settings(true), Isa::fastest()).pixels;
@@ -653,8 +670,11 @@ fn one_bounce_is_no_more_than_the_brightest_face_sends_on() {
 
 #[test]
 fn without_it_the_picture_is_that_of_a_scene_whose_faces_send_on_nothing() {
-    let quality =
-        |secondary| Quality { sampling: Sampling::Fixed(4), secondary, ..Quality::default() };
+    let quality = |secondary| Quality {
+        sampling: Sampling::fixed(4).unwrap(),
+        secondary,
+        ..Quality::default()
+    };
     let size = Size::new(64, 48).unwrap();
     let [on, off] = [true, false].map(|secondary| Settings { size, quality: quality(secondary) });
     // Nothing reflects: no ray more.

@@ -12,7 +12,7 @@ use rtfarm_core::{
     prepare::prepare,
     prepared::{PreparedBytes, PreparedScene},
     scene::Scene,
-    trace::{Probe, ProbeHit},
+    testing::{Probe, ProbeHit, Probing},
 };
 use rtfarm_oracle::{
     Oracle,

@@ -500,7 +500,7 @@ fn a_textured_picture_is_the_same_to_the_bit_however_it_is_made() {
         let settings = settings(64, 48, samples);
         let bits = |area: Area, isa: Isa| {
             let go_on = &mut || ControlFlow::Continue(());
-            let pixels = render_tile(&scene, &settings, area, isa, go_on).unwrap().pixels;
+            let pixels = render_tile(&scene, &settings.quality, area, isa, go_on).unwrap().pixels;
             pixels.iter().map(|pixel| pixel.map(f32::to_bits)).collect::<Vec<_>>()
         };
         let picture = bits(whole(settings.size), Isa::Scalar);
@@ -514,7 +514,7 @@ fn a_textured_picture_is_the_same_to_the_bit_however_it_is_made() {
                 let start = (y * 64 + x0) as usize;
                 picture[start..start + width as usize].iter().copied()
             });
-            let area = Area { x0, y0, width, height };
+            let area = Area::new(settings.size, [x0, y0], [width, height]).unwrap();
             assert!(bits(area, Isa::fastest()).into_iter().eq(rows), "{area:?}");
         }
     }

@@ -6,7 +6,7 @@ use std::{fmt::Write, ops::ControlFlow};
 use rtfarm_core::{
     isa::Isa,
     prepared::{PreparedBytes, PreparedScene},
-    render::{Quality, RenderedTile, Sampling, Settings, render_tile},
+    render::{Quality, RenderedTile, Sampling, render_tile},
     tile::{Area, Size},
 };
 
@@ -20,7 +20,9 @@ const VIEWPORT: &str = "viewport origin 0 0 5 topleft -2 1.5 0 bottomleft -2 -1.
     materials entry name white endentry entry name red color 255 0 0 endentry
     entry name blue color 0 0 255 endentry entry name grey color 120 120 120 endentry endmaterials\n";
 
-const ADAPTIVE: Sampling = Sampling::Adaptive { error: 1.0 / 255.0, most: 256 };
+fn adaptive() -> Sampling {
+    Sampling::adaptive(1.0 / 255.0, 256).unwrap()
+}
 
 fn frame() -> Size {
     Size::new(96, 72).unwrap()
@@ -44,14 +46,13 @@ fn render(
     isa: Isa,
 ) -> RenderedTile {
     let quality = Quality { sampling, seed: 1, ..Quality::default() };
-    let settings = Settings { size: frame(), quality };
-    render_tile(scene, &settings, area, isa, &mut || ControlFlow::Continue(())).unwrap()
+    render_tile(scene, &quality, area, isa, &mut || ControlFlow::Continue(())).unwrap()
 }
 
 /// Which share of a picture's light is lacking in one channel, where `truth` is all of it in
 /// pixels, adaptive and with 64 samples; and how many samples the adaptive pixels have.
 fn lacking(scene: &PreparedScene<PreparedBytes>, channel: usize, truth: f64) -> ([f64; 2], f64) {
-    let [adaptive, fixed] = [ADAPTIVE, Sampling::Fixed(64)]
+    let [adaptive, fixed] = [adaptive(), Sampling::fixed(64).unwrap()]
         .map(|sampling| render(scene, sampling, whole(frame()), Isa::fastest()));
     let lack = |tile: &RenderedTile| {
         1.0 - tile.pixels.iter().map(|pixel| f64::from(pixel[channel])).sum::<f64>() / truth
@@ -155,8 +156,8 @@ fn wires_before_a_fine_mesh_are_in_the_adaptive_picture() {
             writeln!(mesh, "triangle {a}{c}{d} material blue endtriangle").unwrap();
         }
     }
-    let inside = Area { x0: 38, y0: 26, width: 20, height: 20 };
-    let samples = render(&lit_scene(&mesh), ADAPTIVE, inside, Isa::fastest()).tally.samples;
+    let inside = Area::new(frame(), [38, 26], [20, 20]).unwrap();
+    let samples = render(&lit_scene(&mesh), adaptive(), inside, Isa::fastest()).tally.samples;
     eprintln!("the mesh alone: {samples} samples in {} pixels", 22 * 22);
     assert!(samples < 9 * 22 * 22, "a smooth mesh hides nothing");
     for (width, most) in WIDTHS.into_iter().zip(MOST).skip(2) {
@@ -210,7 +211,7 @@ fn bars_are_in_the_adaptive_picture() {
             writeln!(solids, "difference {bar} {ball} enddifference").unwrap();
         }
         let plain = scene(&bars);
-        let truth = render(&plain, Sampling::Fixed(1024), whole(frame()), Isa::fastest());
+        let truth = render(&plain, Sampling::fixed(1024).unwrap(), whole(frame()), Isa::fastest());
         let light = truth.pixels.iter().map(|pixel| f64::from(pixel[0])).sum();
         check(&format!("bars of {width}"), &plain, 0, light, 0.05);
         check(&format!("solid bars of {width}"), &scene(&solids), 0, light, 0.05);
@@ -256,7 +257,7 @@ fn wires_that_pass_the_eye_are_in_the_adaptive_picture() {
         .unwrap();
     }
     let scene = scene(&text);
-    let truth = render(&scene, Sampling::Fixed(1024), whole(frame()), Isa::fastest());
+    let truth = render(&scene, Sampling::fixed(1024).unwrap(), whole(frame()), Isa::fastest());
     let light = truth.pixels.iter().map(|pixel| f64::from(pixel[1])).sum();
     check("wires past the eye", &scene, 1, light, 0.02);
 }
@@ -268,14 +269,14 @@ fn pixels_are_the_same_whatever_the_tile_and_the_instructions() {
         difference sphere coords -0.7 0.2 0 radius 0.4 material white endsphere
             sphere coords -0.7 0.4 0.3 radius 0.3 material grey endsphere enddifference\n";
     let scene = scene(&(fan + ball + WALL));
-    let together = render(&scene, ADAPTIVE, whole(frame()), Isa::Scalar).pixels;
+    let together = render(&scene, adaptive(), whole(frame()), Isa::Scalar).pixels;
     for side in [5, 16, 33] {
         for y0 in (0..72).step_by(side) {
             for x0 in (0..96).step_by(side) {
                 let side = side as u32;
                 let (width, height) = (side.min(96 - x0), side.min(72 - y0));
-                let area = Area { x0, y0, width, height };
-                let tile = render(&scene, ADAPTIVE, area, Isa::fastest()).pixels;
+                let area = Area::new(frame(), [x0, y0], [width, height]).unwrap();
+                let tile = render(&scene, adaptive(), area, Isa::fastest()).pixels;
                 for (k, pixel) in (0..).zip(tile) {
                     let (x, y) = (x0 + k % width, y0 + k / width);
                     assert_eq!(pixel, together[(y * 96 + x) as usize], "({x}, {y}) by {side}");

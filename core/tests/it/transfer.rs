@@ -6,11 +6,11 @@ use std::io::Cursor;
 use image::{DynamicImage, ImageFormat, RgbImage};
 use rtfarm_core::{
     language::{Reading, read_scene_with},
-    picture::{Picture, PictureFormat},
     render::Settings,
     scene::Scene,
     transfer::Transfer,
 };
+use rtfarm_picture::{Picture, PictureFormat};
 
 use crate::support::studio::{self, picture, settings, whole};
 

@@ -5,7 +5,7 @@ use rtfarm_core::{
     prepare::prepare,
     prepared::{PreparedBytes, PreparedScene},
     scene::{Parallelepiped, Scene, SolidNode},
-    trace::{Probe, ProbeHit},
+    testing::{Probe, ProbeHit, Probing},
 };
 use rtfarm_oracle::{
     Oracle,

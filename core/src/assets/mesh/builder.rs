@@ -1,12 +1,16 @@
 //! Vertices and polygons as a file gives them into a mesh without copies.
 
-use hashbrown::{HashTable, hash_table::Entry};
+use hashbrown::hash_table::Entry;
 
 use glam::DVec3;
 
 use super::error::{MeshError, MeshFault};
 use crate::{
-    exact::{hash::HashFunction, polygon, predicates::is_collinear},
+    exact::{
+        polygon,
+        predicates::is_collinear,
+        welding::{PointHasher, PointTable},
+    },
     scene::{DroppedFaces, MeshShape, MeshVertices},
 };
 
@@ -23,9 +27,8 @@ pub struct MeshFile {
 #[derive(Debug)]
 pub(super) struct MeshBuilder<T> {
     vertices: Vec<[T; 3]>,
-    vertex_table: HashTable<u32>,
+    vertex_table: PointTable,
     triangles: Vec<[u32; 3]>,
-    hash_function: HashFunction,
     dropped: DroppedFaces,
 }
 
@@ -35,9 +38,8 @@ impl<T: Copy + Into<f64>> MeshBuilder<T> {
     pub(super) fn with_capacity(vertices: usize, triangles: usize) -> Self {
         Self {
             vertices: Vec::with_capacity(vertices),
-            vertex_table: HashTable::with_capacity(vertices),
+            vertex_table: PointTable::new(PointHasher::new(), vertices),
             triangles: Vec::with_capacity(triangles),
-            hash_function: HashFunction::random(),
             dropped: DroppedFaces::default(),
         }
     }
@@ -45,13 +47,10 @@ impl<T: Copy + Into<f64>> MeshBuilder<T> {
     /// Finds or adds the vertex at a finite position, in which no zero is negative, and gives its
     /// index.
     pub(super) fn add_vertex(&mut self, position: [T; 3]) -> Result<u32, MeshFault> {
-        let (vertices, hash_function) = (&self.vertices, &self.hash_function);
+        let vertices = &self.vertices;
         let bits = |position: &[T; 3]| position.map(|number| number.into().to_bits());
-        let wanted = bits(&position);
-        let is_same = |&index: &u32| bits(&vertices[index as usize]) == wanted;
-        match self.vertex_table.entry(hash_function.hash(wanted), is_same, |&index| {
-            hash_function.hash(bits(&vertices[index as usize]))
-        }) {
+        let bits_at = |index: u32| bits(&vertices[index as usize]);
+        match self.vertex_table.entry(bits(&position), bits_at) {
             Entry::Occupied(known) => Ok(*known.get()),
             Entry::Vacant(place) => {
                 let index = u32::try_from(vertices.len()).map_err(|_| MeshFault::TooLarge)?;
@@ -147,7 +146,7 @@ impl<T: Copy + Into<f64>> MeshBuilder<T> {
         if self.triangles.is_empty() {
             return Err(MeshFault::Empty.of_file());
         }
-        self.vertex_table = HashTable::new();
+        self.vertex_table = PointTable::new(PointHasher::new(), 0); // Its memory is needed.
         self.drop_copies();
         let (mut kept, mut triangles) = (self.vertices, self.triangles);
         kept.shrink_to_fit();

@@ -3,7 +3,7 @@
 use glam::DVec3;
 use rtfarm_core::{
     scene::{Parallelepiped, Scene, SolidNode},
-    trace::{Probe, ProbeHit},
+    testing::{Probe, ProbeHit},
 };
 use rtfarm_oracle::{FaceId, Leaving, Oracle};
 

@@ -29,11 +29,16 @@ pub(crate) fn settings(width: u64, height: u64, samples: u32) -> Settings {
 }
 
 pub(crate) fn quality(samples: u32, seed: u64) -> Quality {
-    Quality { sampling: Sampling::Fixed(samples), seed, secondary: false, ..Quality::default() }
+    Quality {
+        sampling: Sampling::fixed(samples).unwrap(),
+        seed,
+        secondary: false,
+        ..Quality::default()
+    }
 }
 
 pub(crate) fn whole(size: Size) -> Area {
-    Area { x0: 0, y0: 0, width: size.width(), height: size.height() }
+    Area::whole(size)
 }
 
 /// The pixels of an area, row by row. Every channel of every picture is finite and not negative.
@@ -43,7 +48,7 @@ pub(crate) fn pixels(
     area: Area,
 ) -> Vec<[f32; 3]> {
     let go_on = &mut || ControlFlow::Continue(());
-    let pixels = render_tile(scene, settings, area, Isa::fastest(), go_on).unwrap().pixels;
+    let pixels = render_tile(scene, &settings.quality, area, Isa::fastest(), go_on).unwrap().pixels;
     for (k, pixel) in pixels.iter().enumerate() {
         assert!(pixel.iter().all(|c| c.is_finite() && *c >= 0.0), "pixel {k}: {pixel:?}");
     }

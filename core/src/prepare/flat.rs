@@ -1,0 +1,86 @@
+//! Flat faces with their corners.
+
+use std::ops::Range;
+
+use glam::DVec3;
+
+use super::parallelepiped::{box_edges, box_faces};
+use crate::scene::Parallelepiped;
+
+/// The flat faces of a scene, numbered in this order: triangles, quadrangles, then the faces of the
+/// parallelepipeds in solids, six each, which are no items of their own.
+pub(super) struct FlatFaces {
+    /// The corners in the order of the faces: three of each triangle, four of every other face.
+    pub(super) corners: Vec<DVec3>,
+    /// The materials and ranks of all flat faces.
+    pub(super) attributes: Vec<FaceAttributes>,
+    pub(super) triangle_count: usize,
+    /// Quadrangles of their own and the faces of parallelepipeds that stand alone.
+    pub(super) quadrangle_count: usize,
+    /// The edges of each face of a parallelepiped, which are the last of the flat faces: the sum of
+    /// a corner and an edge rounds, and would turn the plane of a needle.
+    pub(super) box_edges: Vec<[DVec3; 2]>,
+}
+
+/// The material of a face and its place in the order of all faces.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct FaceAttributes {
+    pub(super) material: u32,
+    pub(super) rank: u32,
+}
+
+impl FlatFaces {
+    /// Adds the six faces of a parallelepiped at the end; returns their corners.
+    pub(super) fn push_box(&mut self, solid: &Parallelepiped, first_rank: u32) -> [[DVec3; 4]; 6] {
+        let faces = box_faces(solid);
+        self.corners.extend(faces.as_flattened());
+        self.box_edges.extend(box_edges(solid));
+        self.attributes.extend(
+            (first_rank..first_rank + 6)
+                .map(|rank| FaceAttributes { material: solid.material, rank }),
+        );
+        faces
+    }
+
+    /// How many flat faces are items of their own.
+    pub(super) fn item_count(&self) -> usize {
+        self.triangle_count + self.quadrangle_count
+    }
+
+    /// How many corners those have, which stand first.
+    pub(super) fn item_corner_count(&self) -> usize {
+        3 * self.triangle_count + 4 * self.quadrangle_count
+    }
+
+    /// How many flat faces there are.
+    pub(super) fn count(&self) -> usize {
+        self.attributes.len()
+    }
+
+    /// The corners of a face, three or four.
+    pub(super) fn corners_of(&self, face: usize) -> &[DVec3] {
+        let range = self.corner_range(face);
+        &self.corners[range]
+    }
+
+    /// The places of a face's corners among all corners.
+    pub(super) fn corner_range(&self, face: usize) -> Range<usize> {
+        if face < self.triangle_count {
+            3 * face..3 * face + 3
+        } else {
+            let first = 3 * self.triangle_count + 4 * (face - self.triangle_count);
+            first..first + 4
+        }
+    }
+
+    /// The place of a face in the order of all faces.
+    pub(super) fn rank(&self, face: usize) -> u32 {
+        self.attributes[face].rank
+    }
+}
+
+/// The smallest box around points, as its least and its greatest corner; inside out for none.
+pub(super) fn bounds_of(points: &[DVec3]) -> (DVec3, DVec3) {
+    let none = (DVec3::INFINITY, DVec3::NEG_INFINITY);
+    points.iter().fold(none, |(min, max), &point| (min.min(point), max.max(point)))
+}

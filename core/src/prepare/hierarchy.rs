@@ -1,0 +1,88 @@
+//! The fifth step: the bounding volume hierarchy.
+
+use glam::DVec3;
+use rayon::prelude::*;
+
+use super::{
+    bvh::{Bounds, BuildPrimitive, build_bvh},
+    flat::bounds_of,
+    surfaces::Surfaces,
+};
+use crate::{
+    exact::float::{above, below, power_of_two_below_inverse},
+    prepared::node::{Frame, Node},
+};
+
+/// The hierarchy over all items of a scene: flat faces, spheres and solids.
+pub(super) struct Hierarchy {
+    /// Boxes are kept in this frame.
+    pub(super) frame: Frame,
+    pub(super) nodes: Vec<Node>,
+    /// All items in the order in which leaves name them: the numbers of flat faces first, then
+    /// those of spheres, then those of solids.
+    pub(super) order: Vec<u32>,
+}
+
+impl Hierarchy {
+    /// Builds the hierarchy.
+    pub(super) fn new(surfaces: &Surfaces) -> Self {
+        let frame = frame_around(surfaces);
+        let mut primitives = build_primitives(surfaces, &frame);
+        let nodes = build_bvh(&mut primitives);
+        let order = primitives.into_iter().map(|primitive| primitive.item).collect();
+        Self { frame, nodes, order }
+    }
+}
+
+/// The frame around everything.
+fn frame_around(surfaces: &Surfaces) -> Frame {
+    let flat = &surfaces.flat.corners[..surfaces.flat.item_corner_count()];
+    let points = flat.iter().map(|&corner| (corner, corner)).chain(round_bounds(surfaces));
+    let (mut min, mut max) = (DVec3::INFINITY, DVec3::NEG_INFINITY);
+    for (low, high) in points {
+        (min, max) = (min.min(low), max.max(high));
+    }
+    if min.x > max.x {
+        return Frame { origin: [0.0; 3], scale: 1.0 };
+    }
+    let origin = min + (max - min) / 2.0;
+    let extent = (max - origin).max(origin - min).max_element();
+    Frame { origin: origin.to_array(), scale: power_of_two_below_inverse(extent) }
+}
+
+/// The bounds of everything that is not flat: spheres, then solids.
+fn round_bounds(surfaces: &Surfaces) -> impl Iterator<Item = (DVec3, DVec3)> {
+    let spheres = surfaces.spheres.iter().map(|sphere| {
+        let center = DVec3::from_array(sphere.center);
+        (center - sphere.radius, center + sphere.radius)
+    });
+    // An empty intersection has bounds inside out.
+    let solids = surfaces.solid_bounds.iter().map(|&(min, max)| (min.min(max), max.max(min)));
+    spheres.chain(solids).map(|(min, max)| {
+        let blur = 4.0 * f64::EPSILON * min.abs().max(max.abs()).max(max - min);
+        (min - blur, max + blur)
+    })
+}
+
+fn build_primitives(surfaces: &Surfaces, frame: &Frame) -> Vec<BuildPrimitive> {
+    let flat = &surfaces.flat;
+    let origin = DVec3::from_array(frame.origin);
+    let bounds = |(min, max): (DVec3, DVec3)| {
+        // Rounding to f64 must not pull a box in.
+        let relative = |point: DVec3| ((point - origin) * frame.scale).to_array();
+        Bounds {
+            min: relative(min).map(|x| below(x - x.abs() * f64::EPSILON)),
+            max: relative(max).map(|x| above(x + x.abs() * f64::EPSILON)),
+        }
+    };
+    let mut primitives: Vec<BuildPrimitive> = (0..flat.item_count())
+        .into_par_iter()
+        .map(|face| BuildPrimitive {
+            bounds: bounds(bounds_of(flat.corners_of(face))),
+            item: face as u32,
+        })
+        .collect();
+    let round = round_bounds(surfaces).zip(flat.item_count() as u32..);
+    primitives.extend(round.map(|(round, item)| BuildPrimitive { bounds: bounds(round), item }));
+    primitives
+}

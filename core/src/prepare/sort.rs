@@ -1,0 +1,97 @@
+//! The sixth step: records in the order of the hierarchy's leaves.
+
+use glam::DVec3;
+
+use super::{flat::FaceAttributes, surfaces::Surfaces};
+use crate::prepared::record::{
+    CoplanarRecord, Item, Kind, LeafRecord, PlaneRecord, QuadrangleRecord, SolidNodeRecord,
+    SolidRecord, SphereRecord, TriangleRecord,
+};
+
+/// The records of all faces. Those of each kind stand in the order of the hierarchy's leaves, and
+/// vertices in the order in which leaves come to them.
+pub(super) struct Sorted {
+    pub(super) items: Vec<Item>,
+    pub(super) vertices: Vec<[f64; 3]>,
+    pub(super) triangles: Vec<TriangleRecord>,
+    pub(super) coplanars: Vec<CoplanarRecord>,
+    pub(super) quadrangles: Vec<QuadrangleRecord>,
+    pub(super) spheres: Vec<SphereRecord>,
+    pub(super) planes: Vec<PlaneRecord>,
+    pub(super) solids: Vec<SolidRecord>,
+    pub(super) solid_nodes: Vec<SolidNodeRecord>,
+    pub(super) leaves: Vec<LeafRecord>,
+    /// The same solids in file order.
+    pub(super) solids_in_file_order: Vec<SolidRecord>,
+    /// A box around each of those, as its least and its greatest corner.
+    pub(super) solid_bounds: Vec<(DVec3, DVec3)>,
+    /// The corners of the parallelepipeds among the leaves, in the leaves' order: six faces each,
+    /// four corners a face.
+    pub(super) box_corners: Vec<DVec3>,
+}
+
+impl Surfaces {
+    /// Makes the records of all items, in this order of their numbers.
+    pub(super) fn sort(self, order: &[u32]) -> Sorted {
+        let Self { mut flat, solids: solids_in_file_order, .. } = self;
+        let mut items = Vec::with_capacity(order.len());
+        let mut vertices = Vec::new();
+        let mut triangles = Vec::new();
+        let mut coplanars = Vec::new();
+        let mut quadrangles = Vec::new();
+        let mut spheres = Vec::new();
+        let mut solids = Vec::new();
+        let mut numbers = vec![u32::MAX; flat.corners.len()];
+        for &item in order {
+            let face = item as usize;
+            if let Some(round) = face.checked_sub(flat.item_count()) {
+                if let Some(&sphere) = self.spheres.get(round) {
+                    items.push(Item::new(Kind::Sphere, spheres.len()));
+                    spheres.push(sphere);
+                } else {
+                    items.push(Item::new(Kind::Solid, solids.len()));
+                    solids.push(solids_in_file_order[round - self.spheres.len()]);
+                }
+                continue;
+            }
+            let mut corners = [0; 4];
+            for (slot, corner) in corners.iter_mut().zip(flat.corner_range(face)) {
+                let number = &mut numbers[self.first_corners[corner] as usize];
+                if *number == u32::MAX {
+                    *number = vertices.len() as u32;
+                    vertices.push(flat.corners[corner].to_array());
+                }
+                *slot = *number;
+            }
+            let [a, b, c, _] = corners;
+            let FaceAttributes { material, rank } = flat.attributes[face];
+            if let Some(quadrangle) = face.checked_sub(flat.triangle_count) {
+                let plane = self.quadrangle_planes[quadrangle];
+                items.push(Item::new(Kind::Quadrangle, quadrangles.len()));
+                quadrangles.push(QuadrangleRecord::new(corners, material, rank, plane));
+            } else if let Some(plane) = self.triangle_planes[face] {
+                items.push(Item::new(Kind::Coplanar, coplanars.len()));
+                coplanars.push(CoplanarRecord { vertices: [a, b, c], material, rank, plane });
+            } else {
+                items.push(Item::new(Kind::Triangle, triangles.len()));
+                triangles.push(TriangleRecord { vertices: [a, b, c], material, rank });
+            }
+        }
+        let box_corners = flat.corners.split_off(flat.item_corner_count());
+        Sorted {
+            items,
+            vertices,
+            triangles,
+            coplanars,
+            quadrangles,
+            spheres,
+            planes: self.planes,
+            solids,
+            solid_nodes: self.solid_nodes,
+            leaves: self.leaves,
+            solids_in_file_order,
+            solid_bounds: self.solid_bounds,
+            box_corners,
+        }
+    }
+}
