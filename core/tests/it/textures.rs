@@ -111,12 +111,12 @@ fn bombs_are_refused_before_memory_is_taken() {
     check_error(
         "a.png",
         &empty_png(70_000, 1),
-        "it has 70000 x 1 texels; at most 268435456 are read, in sides of at most 65535",
+        "it has 70000 x 1 texels; at most 268435456 are allowed, in sides of at most 65535",
     );
     check_error(
         "a.png",
         &empty_png(60_000, 60_000),
-        "it has 60000 x 60000 texels; at most 268435456 are read, in sides of at most 65535",
+        "it has 60000 x 60000 texels; at most 268435456 are allowed, in sides of at most 65535",
     );
 }
 
