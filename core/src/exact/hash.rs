@@ -20,15 +20,21 @@ impl HashFunction {
         Self { start: random.hash_one(0), seed: SharedSeed::from_u64(random.hash_one(1)) }
     }
 
-    /// The hash of some words in their order.
-    pub(crate) fn hash(&self, words: impl IntoIterator<Item = u64>) -> u64 {
+    /// Hashes some words in their order. Hashes of different counts of words have no relation.
+    #[inline]
+    pub(crate) fn hash<const N: usize>(&self, words: [u64; N]) -> u64 {
         self.extend(self.start, words)
     }
 
-    /// The hash of the words of an earlier `hash` and some more.
-    pub(crate) fn extend(&self, hash: u64, words: impl IntoIterator<Item = u64>) -> u64 {
+    /// Hashes the words of an earlier `hash` and some more.
+    #[inline]
+    pub(crate) fn extend<const N: usize>(&self, hash: u64, words: [u64; N]) -> u64 {
         let mut hasher = FoldHasher::with_seed(hash, &self.seed);
-        words.into_iter().for_each(|word| hasher.write_u64(word));
+        // Two at once: foldhash would put single words together with many instructions.
+        for pair in words.chunks(2) {
+            let [low, high] = [pair[0], pair.get(1).copied().unwrap_or(0)];
+            hasher.write_u128(u128::from(low) | u128::from(high) << 64);
+        }
         hasher.finish()
     }
 }

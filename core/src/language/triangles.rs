@@ -67,8 +67,10 @@ impl Triangles {
         let mut hash = function.extend(vertex_hash, [u64::from(triangle.material)]);
         if let Some(texcoords) = texcoords {
             let first = first_vertex(&triangle.vertices);
-            let texcoord = |k: usize| texcoords[(first + k) % 3].to_array().map(f64::to_bits);
-            hash = function.extend(hash, (0..3).flat_map(texcoord));
+            for k in 0..3 {
+                let texcoord = texcoords[(first + k) % 3].to_array();
+                hash = function.extend(hash, texcoord.map(f64::to_bits));
+            }
         }
         let half = (hash >> 32) as u32;
         let (list, known_texcoords) = (&self.list, &self.texcoords);
@@ -130,9 +132,12 @@ fn first_vertex(vertices: &[DVec3; 3]) -> usize {
 }
 
 /// Hashes the vertices of a triangle; turning it does not change the hash.
+#[inline]
 pub(super) fn hash_vertices(vertices: &[DVec3; 3], function: &HashFunction) -> u64 {
     let first = first_vertex(vertices);
-    function.hash((0..3).flat_map(|k| vertices[(first + k) % 3].to_array().map(f64::to_bits)))
+    let numbers = [0, 1, 2].map(|k| vertices[(first + k) % 3].to_array().map(f64::to_bits));
+    let numbers: [u64; 9] = numbers.as_flattened().try_into().expect("three times three");
+    function.hash(numbers)
 }
 
 /// Makes a whole hash of half a one: tables take the place from the low bits and a tag from the

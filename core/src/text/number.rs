@@ -43,9 +43,11 @@ pub(crate) fn scan_number(text: &[u8], at: &mut usize) -> Option<f64> {
         let size = mantissa as f64 / POWERS_OF_TEN[decimals];
         if is_negative { 0.0 - size } else { size }
     } else {
-        let (number, length) = fast_float2::parse_partial::<f64, _>(&text[start..]).ok()?;
-        here = start + length;
-        (number.is_finite() && is_end(byte_at(here))).then_some(number + 0.0)?
+        while class(byte_at(here)) == Class::Word {
+            here += 1;
+        }
+        is_end(byte_at(here)).then_some(())?;
+        parse_number(&text[start..here]).filter(|number| number.is_finite())?
     };
     *at = here;
     Some(number)
@@ -53,9 +55,10 @@ pub(crate) fn scan_number(text: &[u8], at: &mut usize) -> Option<f64> {
 
 /// Reads a finite number as [`scan_number`] does, in a text without comments: it ends at white
 /// space or with the text.
+#[inline]
 pub(crate) fn scan_number_without_comment(text: &[u8], at: &mut usize) -> Option<f64> {
     let number = scan_number(text, at)?;
-    text.get(*at).is_none_or(|&byte| class(byte) == Class::Space).then_some(number)
+    (text.get(*at) != Some(&b'#')).then_some(number)
 }
 
 fn is_end(byte: u8) -> bool {
