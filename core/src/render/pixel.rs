@@ -6,7 +6,7 @@ use crate::sample::{FEWEST_FOR_ERROR, RUNS};
 
 /// The samples that a pixel has received.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Pixel {
+pub(super) struct Pixel {
     /// Of each run of samples.
     sums: [DVec3; RUNS as usize],
     /// The sum of the samples' squares.
@@ -29,7 +29,7 @@ const EDGE: f64 = 0.65;
 /// square times n^-3. An edge that covers a share c of the pixel, all c as likely, is missed by n
 /// samples with (1 - c)^n, and the mean of c² over these is 2 n^-3; some pixels beside an edge
 /// have none.
-pub(crate) const UNSEEN: f64 = 1.5;
+pub(super) const UNSEEN: f64 = 1.5;
 
 /// What a pixel shows of a contrast that runs evenly through its neighbourhood, as of a shade: a
 /// fourth. What is beyond that is unseen.
@@ -58,33 +58,33 @@ impl Pixel {
     }
 
     /// How many samples there are.
-    pub(crate) fn count(&self) -> u32 {
+    pub(super) fn count(&self) -> u32 {
         self.count
     }
 
     /// The mean of all samples.
-    pub(crate) fn mean(&self) -> DVec3 {
+    pub(super) fn mean(&self) -> DVec3 {
         let [a, b, c, d] = self.sums;
         ((a + b) + (c + d)) / f64::from(self.count)
     }
 
     /// The least and the largest sample, channel by channel.
-    pub(crate) fn range(&self) -> [DVec3; 2] {
+    pub(super) fn range(&self) -> [DVec3; 2] {
         self.range
     }
 
     /// Notes how far apart the first samples of the pixel and its neighbours lie.
-    pub(crate) fn set_contrast(&mut self, contrast: DVec3) {
+    pub(super) fn set_contrast(&mut self, contrast: DVec3) {
         self.contrast = Some(contrast);
     }
 
     /// Notes by how much what no sample has met may change the mean: the expected square.
-    pub(crate) fn set_hidden(&mut self, variance: DVec3) {
+    pub(super) fn set_hidden(&mut self, variance: DVec3) {
         self.hidden = variance;
     }
 
     /// The estimated variance of the mean, per channel; `None` with too few samples.
-    pub(crate) fn variance(&self) -> Option<DVec3> {
+    pub(super) fn variance(&self) -> Option<DVec3> {
         (self.count >= FEWEST_FOR_ERROR).then(|| match self.contrast {
             Some(contrast) => self.careful_variance(contrast),
             None => self.variance_of_runs(),
@@ -92,7 +92,7 @@ impl Pixel {
     }
 
     /// Whether the estimated standard error is below `error` in each channel.
-    pub(crate) fn is_below(&self, error: f64) -> bool {
+    pub(super) fn is_below(&self, error: f64) -> bool {
         self.variance().is_some_and(|variance| variance.max_element() < error * error)
     }
 

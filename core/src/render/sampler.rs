@@ -33,7 +33,7 @@ pub(super) struct Sampler<'a> {
 }
 
 impl<'a> Sampler<'a> {
-    pub(super) fn new(
+    pub(crate) fn new(
         view: &'a View<'a>,
         quality: &'a Quality,
         isa: Isa,

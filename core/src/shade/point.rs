@@ -19,7 +19,7 @@ pub(crate) struct Interaction<'a> {
     /// The distance from the ray's origin, in units of its direction.
     pub(crate) t: f64,
     pub(crate) position: DVec3,
-    pub(crate) face: Face,
+    pub(super) face: Face,
     pub(crate) rank: u32,
     pub(crate) surface: Surface,
     pub(crate) material: &'a MaterialRecord,

@@ -11,7 +11,7 @@ use glam::DVec3;
 pub(crate) struct RayDifferential {
     /// The derivatives of the ray's origin, in the block's units. After
     /// [`RayDifferential::transfer`] they lie in the surface.
-    pub(crate) origin: [DVec3; 2],
+    pub(super) origin: [DVec3; 2],
     /// The derivatives of the ray's unit direction.
     direction: [DVec3; 2],
 }
@@ -22,9 +22,9 @@ pub(crate) struct RayDifferential {
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct SurfaceFootprint {
     /// The sides, in the block's units.
-    pub(crate) sides: [DVec3; 2],
+    pub(super) sides: [DVec3; 2],
     /// The changes of the denominator by s and by t: they draw the far end out.
-    pub(crate) tapers: [f64; 2],
+    pub(super) tapers: [f64; 2],
 }
 
 impl SurfaceFootprint {

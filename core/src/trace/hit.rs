@@ -24,7 +24,7 @@ pub(super) struct Nearest<'a> {
 
 impl<'a> Nearest<'a> {
     #[inline(always)]
-    pub(super) fn new(ray: &'a Ray) -> Self {
+    pub(crate) fn new(ray: &'a Ray) -> Self {
         let shear = Shear::new(ray.origin, ray.direction);
         Self { ray, shear, hit: Hit::none(ray.reach) }
     }

@@ -22,10 +22,10 @@ use crate::prepared::{
 
 /// Where a ray crosses a solid's surface.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(crate) struct Crossing {
+pub(super) struct Crossing {
     /// In units of the ray's direction.
-    pub(crate) t: f64,
-    pub(crate) part: Part,
+    pub(super) t: f64,
+    pub(super) part: Part,
 }
 
 /// Where a ray crosses the boundary of a leaf.
@@ -40,7 +40,7 @@ struct Event {
 
 /// Room to work in, kept from ray to ray.
 #[derive(Debug, Default)]
-pub(crate) struct Scratch {
+pub(super) struct Scratch {
     events: Vec<Event>,
     /// Of each node: whether the ray is inside it, and how many operands it is inside of (of a
     /// difference, those that are taken away).
@@ -53,13 +53,13 @@ pub(crate) struct Scratch {
     /// The face at which each leaf is crossed last.
     faces: Vec<u32>,
     /// The result.
-    pub(crate) crossings: Vec<Crossing>,
+    pub(super) crossings: Vec<Crossing>,
 }
 
 impl Scratch {
     /// Finds where the ray, from its start on, crosses the solid's surface, in order. A surface
     /// that it leaves is crossed at 0, and one that it ends on (`touches`) at its reach.
-    pub(crate) fn cross(
+    pub(super) fn cross(
         &mut self,
         view: &View<'_>,
         solid: &SolidRecord,
