@@ -7,7 +7,7 @@ use crate::sample::{FEWEST_FOR_ERROR, RUNS};
 /// The samples that a pixel has received.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Pixel {
-    /// Of each run of samples.
+    /// The sum of each run of samples.
     sums: [DVec3; RUNS as usize],
     /// The sum of the samples' squares.
     squares: DVec3,
@@ -17,8 +17,8 @@ pub(super) struct Pixel {
     /// How far apart the first samples of the pixel and its neighbours lie, once the neighbours
     /// have been looked at.
     contrast: Option<DVec3>,
-    /// The variance by what no sample has met and may hide in the pixel.
-    hidden: DVec3,
+    /// The variance that faces add which no sample has met.
+    unseen: DVec3,
 }
 
 /// The variance of the mean where an edge crosses a pixel is about this times the samples' own
@@ -43,14 +43,14 @@ impl Default for Pixel {
             range: [DVec3::INFINITY, DVec3::NEG_INFINITY],
             count: 0,
             contrast: None,
-            hidden: DVec3::ZERO,
+            unseen: DVec3::ZERO,
         }
     }
 }
 
 impl Pixel {
     /// Takes in what the next sample saw: they come in the order of their numbers.
-    pub(crate) fn add(&mut self, color: DVec3) {
+    pub(super) fn add(&mut self, color: DVec3) {
         self.sums[(self.count % RUNS) as usize] += color;
         self.squares += color * color;
         self.range = [self.range[0].min(color), self.range[1].max(color)];
@@ -78,9 +78,9 @@ impl Pixel {
         self.contrast = Some(contrast);
     }
 
-    /// Notes by how much what no sample has met may change the mean: the expected square.
-    pub(super) fn set_hidden(&mut self, variance: DVec3) {
-        self.hidden = variance;
+    /// Notes the variance that faces add to the mean which no sample has met.
+    pub(super) fn set_unseen(&mut self, variance: DVec3) {
+        self.unseen = variance;
     }
 
     /// The estimated variance of the mean, per channel; `None` with too few samples.
@@ -118,9 +118,9 @@ impl Pixel {
         let mean = self.mean();
         let variance = (self.squares / n - mean * mean).max(DVec3::ZERO) * (n / (n - 1.0));
         let of_edge = variance * (EDGE / (n * n.sqrt()));
-        let unseen = (contrast - EVEN * (self.range[1] - self.range[0])).max(DVec3::ZERO);
-        let of_unseen = unseen * unseen * (UNSEEN / (n * n * n));
-        (self.variance_of_runs() + of_edge) / 2.0 + of_unseen + self.hidden
+        let missed = (contrast - EVEN * (self.range[1] - self.range[0])).max(DVec3::ZERO);
+        let of_contrast = missed * missed * (UNSEEN / (n * n * n));
+        (self.variance_of_runs() + of_edge) / 2.0 + of_contrast + self.unseen
     }
 }
 

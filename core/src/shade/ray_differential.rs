@@ -5,6 +5,8 @@
 
 use glam::DVec3;
 
+use super::optics::squared_cosine_behind;
+
 /// The derivatives of a ray by its sample's place on the screen, first across and then down. A step
 /// of 1 is the width of the square that belongs to one sample.
 #[derive(Debug, Clone, Copy)]
@@ -75,7 +77,7 @@ impl RayDifferential {
         ratio: f64,
     ) -> Self {
         let cosine = -direction.dot(normal);
-        let cosine_behind = (1.0 - ratio * ratio * ((1.0 - cosine) * (1.0 + cosine))).sqrt();
+        let cosine_behind = squared_cosine_behind(cosine, ratio).sqrt();
         let slope = ratio - ratio * ratio * cosine / cosine_behind;
         self.turn(direction, normal, curvature, [ratio, ratio * cosine - cosine_behind, slope])
     }

@@ -107,7 +107,7 @@ impl Shear {
         }
     }
 
-    /// Of each vertex. A loop, for the closure of a `map` is called where a kernel is compiled for
+    /// Projects every vertex. This is a loop, since the closure of a `map` is called where a kernel is compiled for
     /// an instruction set.
     #[inline(always)]
     pub(super) fn project_all<const N: usize>(&self, vertices: [&[f64; 3]; N]) -> [Projected; N] {

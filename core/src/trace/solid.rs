@@ -42,11 +42,13 @@ struct Event {
 #[derive(Debug, Default)]
 pub(super) struct Scratch {
     events: Vec<Event>,
-    /// Of each node: whether the ray is inside it, and how many operands it is inside of (of a
-    /// difference, those that are taken away).
+    /// For each node, whether the ray is inside it.
     inside: Vec<bool>,
+    /// For each node, how many operands the ray is inside of; a difference counts those that are
+    /// taken away.
     counts: Vec<u32>,
-    /// At which crossing each node was last flipped, and whether the ray was inside it before.
+    /// For each node, the crossing at which it was last flipped, and whether the ray was inside it
+    /// before.
     flipped: Vec<u32>,
     before: Vec<bool>,
     crossing: u32,
