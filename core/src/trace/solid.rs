@@ -60,19 +60,19 @@ pub(super) struct Scratch {
 
 impl Scratch {
     /// Finds where the ray, from its start on, crosses the solid's surface, in order. A surface
-    /// that it leaves is crossed at 0, and one that it ends on (`touches`) at its reach.
+    /// that it leaves is crossed at 0, and one that it ends on (`ending_on`) at its reach.
     pub(super) fn cross(
         &mut self,
         view: &View<'_>,
         solid: &SolidRecord,
         ray: &Ray,
-        touches: &[Surface],
+        ending_on: &[Surface],
     ) {
         self.crossings.clear();
         self.events.clear();
         let leaves = view.solid_leaves(solid);
         for (number, leaf) in (0..).zip(leaves) {
-            push_events(&mut self.events, view, leaf, number, ray, touches);
+            push_events(&mut self.events, view, leaf, number, ray, ending_on);
         }
         if self.events.is_empty() {
             return;
@@ -192,13 +192,13 @@ fn push_events(
     leaf: &LeafRecord,
     number: u32,
     ray: &Ray,
-    touches: &[Surface],
+    ending_on: &[Surface],
 ) {
     // Of coordinates below 1, with the ray's own length on top.
     let doubt_of = |t: f64, cosine: f64| {
         4.0 * f64::EPSILON * (1.0 + ray.origin.abs().max_element() + t.abs()) / cosine.max(1e-12)
     };
-    let ends_on = |surface: Surface| touches.contains(&surface);
+    let ends_on = |surface: Surface| ending_on.contains(&surface);
     if leaf.is_sphere() {
         let center = DVec3::from_array(leaf.center);
         let surface = Surface(leaf.surface);
