@@ -76,6 +76,13 @@ impl<'a> Interaction<'a> {
         }
     }
 
+    /// A ray that leaves the surface here; `after` is as in [`Ray`].
+    #[inline(always)]
+    pub(crate) fn leave(&self, direction: DVec3, after: u32) -> Ray {
+        let (origin, leaving) = (self.position, self.surface);
+        Ray { origin, direction, reach: f64::INFINITY, leaving, after }
+    }
+
     /// By how much a step along the face turns the normal, per unit of the step.
     pub(crate) fn curvature(&self, view: &View<'_>) -> f64 {
         self.face.curvature(view, self.position, self.normal)

@@ -143,6 +143,9 @@ impl BoxKernel for ScalarBoxes {
 }
 
 /// Work that is compiled once for each instruction set.
-pub(super) trait KernelWork {
-    fn run(&mut self, kernel: impl BoxKernel);
+///
+/// What it reads all the time is an argument of its own: the compiler knows of an argument that
+/// nothing else changes it, and keeps what it has loaded.
+pub(super) trait KernelWork<Input> {
+    fn run(&mut self, input: &Input, kernel: impl BoxKernel);
 }

@@ -6,14 +6,14 @@ use super::boxes_x86::{Avx2Boxes, Sse2Boxes};
 use crate::isa::Isa;
 
 /// Does work with the kernel of an instruction set, which this CPU must have.
-pub(super) fn run_with_kernel(isa: Isa, work: &mut impl KernelWork) {
+pub(super) fn run_with_kernel<Input>(isa: Isa, input: &Input, work: &mut impl KernelWork<Input>) {
     const LACKING: &str = "instruction sets are chosen among those that the CPU has";
     match isa {
-        Isa::Scalar => work.run(ScalarBoxes),
+        Isa::Scalar => work.run(input, ScalarBoxes),
         #[cfg(target_arch = "x86_64")]
-        Isa::Sse2 => work.run(Sse2Boxes::new()),
+        Isa::Sse2 => work.run(input, Sse2Boxes::new()),
         #[cfg(target_arch = "x86_64")]
-        Isa::Avx2 => Avx2Boxes::detect().expect(LACKING).run(work),
+        Isa::Avx2 => Avx2Boxes::detect().expect(LACKING).run(input, work),
         #[cfg(not(target_arch = "x86_64"))]
         Isa::Sse2 | Isa::Avx2 => panic!("{LACKING}"),
     }
@@ -74,20 +74,16 @@ mod tests {
     }
 
     /// What a kernel finds in a node: the mask, and the bits of the distances of what is met.
-    struct Test<'a> {
-        node: &'a Node,
-        ray: &'a BoxRay,
-        found: Option<(u32, [u32; 8])>,
-    }
+    type Found = (u32, [u32; 8]);
 
-    impl KernelWork for Test<'_> {
-        fn run(&mut self, kernel: impl BoxKernel) {
-            let (distances, mask) = kernel.test(self.node, self.ray);
+    impl KernelWork<(Node, BoxRay)> for Option<Found> {
+        fn run(&mut self, (node, ray): &(Node, BoxRay), kernel: impl BoxKernel) {
+            let (distances, mask) = kernel.test(node, ray);
             let mut bits = distances.map(f32::to_bits);
             for (child, bits) in bits.iter_mut().enumerate() {
                 *bits *= mask >> child & 1;
             }
-            self.found = Some((mask, bits));
+            *self = Some((mask, bits));
         }
     }
 
@@ -96,16 +92,16 @@ mod tests {
         let random = &mut Random::new(17);
         let mut met = 0;
         for _ in 0..20_000 {
-            let (node, ray) = (random_node(random), random_ray(random));
+            let input = (random_node(random), random_ray(random));
             let find = |isa| {
-                let mut test = Test { node: &node, ray: &ray, found: None };
-                run_with_kernel(isa, &mut test);
-                test.found.expect("the kernel ran")
+                let mut found = None;
+                run_with_kernel(isa, &input, &mut found);
+                found.expect("the kernel ran")
             };
             let scalar = find(Isa::Scalar);
             met += scalar.0.count_ones();
             for isa in Isa::ALL.into_iter().filter(|isa| isa.is_supported()) {
-                assert_eq!(find(isa), scalar, "{isa}: {node:?} {ray:?}");
+                assert_eq!(find(isa), scalar, "{isa}: {input:?}");
             }
         }
         assert!(met > 10_000, "{met} of 160,000 boxes are met");
