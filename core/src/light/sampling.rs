@@ -51,6 +51,7 @@ fn hemisphere_probability(importance: &Importance) -> f64 {
 /// Source: Veach & Guibas, "Optimally Combining Sampling Techniques for Monte Carlo Rendering"
 /// (1995): the balance heuristic, here for the light of each emitter on its own, so that only the
 /// chosen one's density must be known.
+#[inline]
 pub(super) fn sample_light(
     view: &View<'_>,
     receiver: &Receiver,
@@ -136,6 +137,7 @@ fn relative_density(
 
 /// Chooses a direction with the density cosine / π, by two numbers in 0..1. It is `None` where
 /// rounding leads below the horizon.
+#[inline]
 fn sample_hemisphere(
     receiver: &Receiver,
     hemisphere_probability: f64,
