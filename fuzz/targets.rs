@@ -11,7 +11,7 @@ use rtfarm_core::{
     prepare::prepare,
     prepared::{PreparedBytes, PreparedError, PreparedScene},
     read::{Severity, Style, draw_diagnostics, read_scene},
-    render::{Quality, Sampling, Settings, render_tile},
+    render::{Cutoff, Quality, Sampling, render_tile},
     scene::{MeshVertices, Scene, SolidNode},
     texture::read_texture,
     tile::{Area, Size},
@@ -111,15 +111,16 @@ pub(crate) fn prepared(data: &[u8]) {
         Err(error) => return assert_ne!(error, PreparedError::Damaged, "the hash has moved"),
     };
     let sampling = match changes.len() % 4 {
-        0 | 1 => Sampling::Fixed(1),
-        _ => Sampling::Adaptive { error: 0.1, most: 16 },
+        0 | 1 => Sampling::fixed(1),
+        _ => Sampling::adaptive(0.1, 16),
     };
-    let quality = Quality { sampling, cutoff: 0.01, ..Quality::default() };
-    let settings = Settings { size: Size::new(4, 4).expect("a size"), quality };
-    let area = Area { x0: 0, y0: 0, width: 4, height: 4 };
+    let sampling = sampling.expect("both are in range");
+    let cutoff = Cutoff::new(0.01).expect("a weight");
+    let quality = Quality { sampling, cutoff, ..Quality::default() };
+    let area = Area::whole(Size::new(4, 4).expect("a size"));
     let picture = |isa| {
         let go_on = &mut || ControlFlow::Continue(());
-        let pixels = render_tile(&scene, &settings, area, isa, go_on).expect("nobody stops").pixels;
+        let pixels = render_tile(&scene, &quality, area, isa, go_on).expect("nobody stops").pixels;
         // One NaN is as good as another.
         let bits = |channel: f32| if channel.is_nan() { 0 } else { channel.to_bits() };
         pixels.into_iter().map(|pixel| pixel.map(bits)).collect::<Vec<_>>()

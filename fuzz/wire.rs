@@ -2,7 +2,8 @@
 //! test with every file of its corpus.
 
 use prost::Message;
-use rtfarm_core::{picture::PictureFormat, render::Settings, tile::Size};
+use rtfarm_core::{render::Settings, tile::Size};
+use rtfarm_picture::PictureFormat;
 use rtfarm_proto::{LeaseName, pixels_from_bytes, pixels_to_bytes, scene_hash, transfer, wire};
 
 /// A message of the kind that the first byte says: it is refused, or written again it is read as
@@ -89,8 +90,7 @@ fn check_settings(settings: wire::Settings) {
     if let Ok(known) = Settings::try_from(settings) {
         assert!((1..=65_535).contains(&known.size.width()));
         assert!((1..=65_535).contains(&known.size.height()));
-        let quality = known.quality;
-        assert!((0.0..=1.0).contains(&quality.cutoff));
+        assert!((0.0..=1.0).contains(&known.quality.cutoff.get()));
         assert_eq!(wire::Settings::from(known), settings);
     }
 }

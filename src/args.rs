@@ -1,16 +1,17 @@
 //! The command line's words.
 
-use std::{fmt, path::PathBuf, str::FromStr, time::Duration};
+use std::{fmt, ops::RangeInclusive, path::PathBuf, str::FromStr, time::Duration};
 
 use clap::{Args as ClapArgs, Parser, Subcommand, ValueEnum, value_parser};
-use rtfarm_coordinator::Wish;
 use rtfarm_core::{
     isa::{Isa, IsaError},
-    picture::PictureFormat,
-    render::{DEFAULT_CUTOFF, DEFAULT_ERROR, DEFAULT_MOST_SAMPLES, Quality, Sampling},
+    render::{Cutoff, Quality, SampleCount, SampleLimit, Sampling, StandardError},
     tile::{Size, SizeError, TileGrid},
     transfer::Transfer,
 };
+use rtfarm_job::RenderRequest;
+use rtfarm_ladder::Effort;
+use rtfarm_picture::PictureFormat;
 use rtfarm_proto::Address;
 
 use crate::output::Output;
@@ -35,7 +36,7 @@ pub(crate) enum Command {
     Submit(SubmitArgs),
     /// Say what is wrong with a scene, and what it needs.
     Check(CheckArgs),
-    /// Measure speed against error.
+    /// Measure speed against error of a scene, whose picture at many samples stands for the truth.
     Report(ReportArgs),
 }
 
@@ -74,10 +75,9 @@ pub(crate) struct CheckArgs {
 
 #[derive(Debug, ClapArgs)]
 pub(crate) struct ReportArgs {
-    /// The scene to measure, against its own picture at many samples; pictures with closed forms
-    /// by default.
+    /// The scene to measure.
     #[arg(value_name = "SCENE")]
-    pub(crate) scene: Option<PathBuf>,
+    scene: PathBuf,
 
     /// The folder that report.md and its plots go into; without it the report goes to standard
     /// output.
@@ -89,28 +89,8 @@ pub(crate) struct ReportArgs {
     pub(crate) effort: Effort,
 
     /// The error of SCENE's picture that is wanted, where 1 is full light; some by default.
-    #[arg(long, value_name = "ERROR", requires = "scene", value_parser = parse_error)]
+    #[arg(long, value_name = "ERROR", value_parser = parse_error)]
     pub(crate) wanted: Option<f64>,
-
-    /// A folder with what other programs made of the scenes and rays of `--for-peers`, to stand
-    /// beside rtfarm's.
-    #[arg(long, value_name = "DIR", conflicts_with = "scene")]
-    pub(crate) peers: Option<PathBuf>,
-
-    /// Only write these scenes and rays into a folder, for the same effort.
-    #[arg(long, value_name = "DIR", conflicts_with_all = ["scene", "peers", "out"])]
-    pub(crate) for_peers: Option<PathBuf>,
-}
-
-/// How much work goes into a report.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
-pub(crate) enum Effort {
-    /// Some seconds: whether it works.
-    Smoke,
-    /// Some minutes.
-    Quick,
-    /// Figures worth publishing.
-    Full,
 }
 
 /// What picture is wanted.
@@ -123,22 +103,22 @@ pub(crate) struct PictureArgs {
     #[arg(short, long = "output", value_name = "FILE")]
     output: PathBuf,
 
-    /// The picture's size in pixels; the scene's own wish by default.
+    /// The picture's size in pixels; the size that the scene asks for by default.
     #[arg(long, value_name = "WxH", value_parser = parse_size)]
     size: Option<Size>,
 
     /// The same number of samples in every pixel.
-    #[arg(long, value_name = "N", value_parser = value_parser!(u32).range(1..=65_536), conflicts_with_all = ["error", "max_samples"])]
-    samples: Option<u32>,
+    #[arg(long, value_name = "N", value_parser = parse_samples, conflicts_with_all = ["error", "max_samples"])]
+    samples: Option<SampleCount>,
 
     /// Sample each pixel until its standard error is below this, where 1 is full light; not
     /// encoded, whatever the --transfer. Default: 1/255, an 8-bit step.
-    #[arg(long, value_name = "ERROR", default_value_t = DEFAULT_ERROR, hide_default_value = true, value_parser = parse_error)]
-    error: f64,
+    #[arg(long, value_name = "ERROR", default_value_t = StandardError::EIGHT_BIT_STEP, hide_default_value = true, value_parser = parse_error)]
+    error: StandardError,
 
     /// But at most so often.
-    #[arg(long, value_name = "N", default_value_t = DEFAULT_MOST_SAMPLES, value_parser = value_parser!(u32).range(8..=65_536))]
-    max_samples: u32,
+    #[arg(long, value_name = "N", default_value_t = SampleLimit::DEFAULT, value_parser = parse_max_samples)]
+    max_samples: SampleLimit,
 
     /// Chooses the random numbers.
     #[arg(long, value_name = "N", default_value_t = 0)]
@@ -150,8 +130,8 @@ pub(crate) struct PictureArgs {
 
     /// Mirrored and transmitted light that counts less than this in its sample is taken for
     /// background.
-    #[arg(long, value_name = "WEIGHT", default_value_t = DEFAULT_CUTOFF, value_parser = parse_share)]
-    cutoff: f64,
+    #[arg(long, value_name = "WEIGHT", default_value_t = Cutoff::DEFAULT, value_parser = parse_cutoff)]
+    cutoff: Cutoff,
 
     /// Whether surfaces that mirror light others.
     #[arg(long, value_name = "on|off", default_value = "on", hide_possible_values = true)]
@@ -313,8 +293,8 @@ impl FromStr for IsaChoice {
 
 impl ReportArgs {
     /// The user's own scene.
-    pub(crate) fn scene(&self) -> Option<SceneArgs> {
-        self.scene.clone().map(|path| SceneArgs { path, strict: false })
+    pub(crate) fn scene(&self) -> SceneArgs {
+        SceneArgs { path: self.scene.clone(), strict: false }
     }
 }
 
@@ -325,8 +305,8 @@ impl PictureArgs {
     }
 
     /// What is wanted of the scene.
-    pub(crate) fn wish(&self, format: PictureFormat) -> Wish {
-        Wish {
+    pub(crate) fn request(&self, format: PictureFormat) -> RenderRequest {
+        RenderRequest {
             name: self.scene.name(),
             strict: self.scene.strict,
             size: self.size,
@@ -387,13 +367,23 @@ fn parse_size(text: &str) -> Result<Size, String> {
     Size::new(width, height).map_err(|error: SizeError| error.to_string())
 }
 
-fn parse_error(text: &str) -> Result<f64, String> {
-    let error: f64 = text.parse().map_err(|_| "a number is wanted")?;
-    if Sampling::is_error(error) {
-        Ok(error)
-    } else {
-        Err("an error is above 0 and at most 1".to_owned())
-    }
+fn parse_samples(text: &str) -> Result<SampleCount, String> {
+    let count = text.parse().ok().and_then(SampleCount::new);
+    count.ok_or_else(|| out_of_range("the number of samples", &SampleCount::RANGE))
+}
+
+fn parse_max_samples(text: &str) -> Result<SampleLimit, String> {
+    let limit = text.parse().ok().and_then(SampleLimit::new);
+    limit.ok_or_else(|| out_of_range("the most samples", &SampleLimit::RANGE))
+}
+
+fn out_of_range(what: &str, range: &RangeInclusive<u32>) -> String {
+    format!("{what} must be a whole number from {} to {}", range.start(), range.end())
+}
+
+fn parse_error(text: &str) -> Result<StandardError, &'static str> {
+    let error = text.parse().ok().and_then(StandardError::new);
+    error.ok_or("an error must be a number above 0 and at most 1")
 }
 
 fn parse_transfer(text: &str) -> Result<Transfer, String> {
@@ -404,9 +394,9 @@ fn parse_transfer(text: &str) -> Result<Transfer, String> {
     }
 }
 
-fn parse_share(text: &str) -> Result<f64, String> {
-    let share: f64 = text.parse().map_err(|_| "a number is wanted")?;
-    if (0.0..=1.0).contains(&share) { Ok(share) } else { Err("a weight is from 0 to 1".to_owned()) }
+fn parse_cutoff(text: &str) -> Result<Cutoff, &'static str> {
+    let cutoff = text.parse().ok().and_then(Cutoff::new);
+    cutoff.ok_or("a weight must be a number from 0 to 1")
 }
 
 fn parse_seconds(text: &str) -> Result<Duration, String> {

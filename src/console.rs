@@ -7,8 +7,8 @@ use std::{
 };
 
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
-use rtfarm_coordinator::Progress;
 use rtfarm_core::read::Style;
+use rtfarm_job::Progress;
 use tokio::time::Instant;
 use tracing_subscriber::{EnvFilter, fmt::MakeWriter};
 

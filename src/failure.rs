@@ -1,6 +1,6 @@
 //! What went wrong, in one line, and the exit code that says so.
 
-use std::process::ExitCode;
+use std::{fmt, process::ExitCode};
 
 use crate::console::Console;
 
@@ -23,24 +23,32 @@ impl<E: Into<anyhow::Error>> From<E> for Failure {
     }
 }
 
+impl fmt::Display for Failure {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Input(error) | Self::Other(error) => write!(f, "{error:#}"),
+            Self::Told => Ok(()),
+            Self::Interrupted => f.write_str("interrupted"),
+        }
+    }
+}
+
 impl Failure {
+    /// What the process ends with.
+    pub(crate) fn exit_code(&self) -> u8 {
+        match self {
+            Self::Other(_) => 1,
+            Self::Input(_) | Self::Told => 2,
+            Self::Interrupted => 130,
+        }
+    }
+
     /// Tells the user, and chooses the exit code.
     pub(crate) fn tell(&self, console: &Console) -> ExitCode {
-        match self {
-            Self::Input(error) => {
-                console.tell(&format!("error: {error:#}"));
-                ExitCode::from(2)
-            }
-            Self::Told => ExitCode::from(2),
-            Self::Other(error) => {
-                console.tell(&format!("error: {error:#}"));
-                ExitCode::from(1)
-            }
-            Self::Interrupted => {
-                console.tell("error: interrupted");
-                ExitCode::from(130)
-            }
+        if !matches!(self, Self::Told) {
+            console.tell(&format!("error: {self}"));
         }
+        ExitCode::from(self.exit_code())
     }
 }
 

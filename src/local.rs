@@ -12,14 +12,9 @@ use std::{
 
 use anyhow::Context;
 use rayon::ThreadPoolBuilder;
-use rtfarm_coordinator::{Order, Progress, TileCost, log_tile, new_picture};
-use rtfarm_core::{
-    isa::Isa,
-    picture::{Picture, PutError},
-    prepared::PreparedScene,
-    render::render_tile,
-};
-use rtfarm_proto::WorkerId;
+use rtfarm_core::{isa::Isa, prepared::PreparedScene, render::render_tile};
+use rtfarm_job::{FinishedTile, Order, Progress};
+use rtfarm_picture::{Picture, PutError};
 use tokio::{sync::watch, time::Instant};
 use tokio_util::sync::CancellationToken;
 
@@ -32,7 +27,7 @@ pub(crate) fn render(
     stop: &CancellationToken,
 ) -> anyhow::Result<Option<(Picture, Duration)>> {
     let Order { prepared, settings, grid, transfer, format, .. } = order;
-    let picture = new_picture(folder, settings.size, format, transfer)
+    let picture = Picture::new_in(folder, settings.size, format, transfer)
         .with_context(|| format!("cannot make the picture's file in {}", folder.display()))?;
     let scene = PreparedScene::open(prepared)?;
     let pool = ThreadPoolBuilder::new().num_threads(threads).build()?;
@@ -48,7 +43,9 @@ pub(crate) fn render(
             let tile_started = Instant::now();
             let area = grid.area(tile);
             let mut on_progress = on_progress;
-            let Some(rendered) = render_tile(&scene, &settings, area, isa, &mut on_progress) else {
+            let Some(rendered) =
+                render_tile(&scene, &settings.quality, area, isa, &mut on_progress)
+            else {
                 return;
             };
             let seconds = tile_started.elapsed().as_secs_f64();
@@ -57,14 +54,14 @@ pub(crate) fn render(
                 failure.lock().expect("nothing here panics").get_or_insert(error);
                 return;
             }
-            let mut done = 0;
+            let mut now_done = Progress::default();
             progress.send_modify(|progress| {
                 progress.tiles_done += 1;
                 progress.tally.add(&rendered.tally);
-                done = progress.tiles_done;
+                now_done.clone_from(progress);
             });
-            let cost = TileCost { seconds, rays: rendered.tally.rays };
-            log_tile(done, grid.count(), tile, WorkerId(0), &cost, started.elapsed());
+            let rays = rendered.tally.rays;
+            FinishedTile { tile, worker: None, seconds, rays }.log(&now_done, started.elapsed());
         }
     });
     if let Some(error) = failure.into_inner().expect("nothing here panics") {

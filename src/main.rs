@@ -12,6 +12,7 @@ mod pilot;
 mod render;
 mod report;
 mod source;
+mod submission;
 mod submit;
 mod worker;
 

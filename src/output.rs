@@ -8,8 +8,7 @@ use std::{
 };
 
 use anyhow::{Context, bail, ensure};
-use rtfarm_coordinator::folder_of;
-use rtfarm_core::picture::PictureFormat;
+use rtfarm_picture::PictureFormat;
 use tempfile::NamedTempFile;
 use tokio_util::sync::CancellationToken;
 
@@ -112,5 +111,13 @@ impl Write for OutputFile<'_> {
 impl Seek for OutputFile<'_> {
     fn seek(&mut self, to: SeekFrom) -> io::Result<u64> {
         self.file.seek(to)
+    }
+}
+
+/// The folder in which a file of that path stands.
+pub(crate) fn folder_of(path: &Path) -> PathBuf {
+    match path.parent() {
+        Some(folder) if !folder.as_os_str().is_empty() => folder.to_owned(),
+        _ => PathBuf::from("."),
     }
 }

@@ -3,14 +3,14 @@
 use std::time::Duration;
 
 use rayon::prelude::*;
-use rtfarm_coordinator::Order;
 use rtfarm_core::{
     isa::Isa,
     prepared::{PreparedBytes, PreparedScene},
-    render::{DEFAULT_ERROR, DEFAULT_MOST_SAMPLES, Quality, Sampling, Settings, render_tile},
-    sample::MOST_SAMPLES,
+    render::{Quality, Sampling, render_tile},
     tile::{Area, Size},
 };
+use rtfarm_job::Order;
+use rtfarm_ladder::adaptive_settings;
 use tokio::time::Instant;
 use tokio_util::sync::CancellationToken;
 
@@ -23,21 +23,7 @@ const SIDE: u32 = 16;
 /// The part of the time that a prediction may take up: it is off by some per cent.
 const PART: f64 = 0.9;
 
-/// The settings from coarse to fine: each asks for an error smaller by √2 than the one before.
-/// Below an 8-bit step pixels may have more samples as well.
-pub(crate) fn ladder() -> impl Iterator<Item = Sampling> {
-    (0..=22).map(|rung: u32| {
-        let halves = f64::from(1_u32 << (rung / 2));
-        let half = if rung.is_multiple_of(2) { 1.0 } else { std::f64::consts::SQRT_2 };
-        let most = DEFAULT_MOST_SAMPLES << rung.saturating_sub(8).min(8);
-        Sampling::Adaptive {
-            error: 16.0 * DEFAULT_ERROR / (halves * half),
-            most: most.min(MOST_SAMPLES),
-        }
-    })
-}
-
-/// Chooses the finest setting of the ladder with which `threads` threads render the picture in
+/// Chooses the finest of the [`adaptive_settings`] with which `threads` threads render the picture in
 /// `time`, what the choice itself takes included; the coarsest where none does. `None` when `stop`
 /// came first. Never call this on the async runtime.
 pub(crate) fn choose(
@@ -54,9 +40,8 @@ pub(crate) fn choose(
     let pixels: usize = squares.iter().map(|square| square.pixel_count()).sum();
     let whole = size.pixel_count() as f64 / pixels as f64;
     let mut chosen = None;
-    for sampling in ladder() {
+    for sampling in adaptive_settings() {
         let quality = Quality { sampling, ..order.settings.quality };
-        let settings = Settings { size, quality };
         let rung_started = Instant::now();
         let is_whole = pool.install(|| {
             squares.par_iter().all(|&square| {
@@ -67,7 +52,7 @@ pub(crate) fn choose(
                         std::ops::ControlFlow::Continue(())
                     }
                 };
-                render_tile(&scene, &settings, square, isa, on_progress).is_some()
+                render_tile(&scene, &quality, square, isa, on_progress).is_some()
             })
         });
         if !is_whole {
@@ -80,7 +65,7 @@ pub(crate) fn choose(
         }
         chosen = Some(sampling);
     }
-    Ok(chosen.or_else(|| ladder().next()))
+    Ok(chosen.or_else(|| adaptive_settings().next()))
 }
 
 /// Squares all over the frame.
@@ -96,8 +81,11 @@ fn squares(size: Size) -> Vec<Area> {
             .collect()
     };
     let (columns, rows) = (places(size.width()), places(size.height()));
-    let across =
-        |(y0, height)| columns.iter().map(move |&(x0, width)| Area { x0, y0, width, height });
+    let across = |(y0, height)| {
+        columns.iter().map(move |&(x0, width)| {
+            Area::new(size, [x0, y0], [width, height]).expect("a square inside the frame")
+        })
+    };
     rows.iter().copied().flat_map(across).collect()
 }
 
@@ -106,27 +94,11 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_ladder_falls_and_every_rung_can_be_asked_for() {
-        let rungs: Vec<Sampling> = ladder().collect();
-        let errors: Vec<f64> = (rungs.iter())
-            .map(|rung| match *rung {
-                Sampling::Adaptive { error, most } => {
-                    assert!(Sampling::is_error(error) && Sampling::MOST_COUNTS.contains(&most));
-                    error
-                }
-                Sampling::Fixed(_) => panic!("{rung:?}"),
-            })
-            .collect();
-        assert!(errors.is_sorted_by(|a, b| a > b), "{errors:?}");
-        assert!(rungs.contains(&Sampling::Adaptive { error: DEFAULT_ERROR, most: 256 }));
-    }
-
-    #[test]
     fn squares_lie_in_the_frame() {
         for (width, height) in [(1, 1), (17, 3), (100, 75), (65_535, 2), (1280, 720)] {
             for area in squares(Size::new(width, height).unwrap()) {
-                assert!(u64::from(area.x0 + area.width) <= width, "{area:?}");
-                assert!(u64::from(area.y0 + area.height) <= height, "{area:?}");
+                assert!(u64::from(area.columns().end) <= width, "{area:?}");
+                assert!(u64::from(area.rows().end) <= height, "{area:?}");
             }
         }
     }

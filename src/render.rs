@@ -10,14 +10,15 @@ use std::{
 };
 
 use anyhow::{Context, anyhow};
-use rtfarm_coordinator::{Config, Coordinator, End, Job, Listener, Order, Progress, Refusal};
+use rtfarm_coordinator::{Config, Coordinator, Job, Listener};
 use rtfarm_core::{
-    picture::Picture,
     read::draw_diagnostics,
     render::{Sampling, Tally},
     tile::Size,
     transfer::Transfer,
 };
+use rtfarm_job::{Order, Outcome, Progress, Refusal};
+use rtfarm_picture::Picture;
 use rtfarm_proto::Address;
 use tempfile::TempDir;
 use tokio::{net::UnixListener, sync::watch, task::spawn_blocking, time::Instant};
@@ -156,11 +157,11 @@ async fn place(
     console: &Console,
     stop: &CancellationToken,
 ) -> Result<Order, Failure> {
-    let wish = args.wish(output.format());
+    let request = args.request(output.format());
     let folder = scene_folder(&args.scene);
     let (name, style) = (args.scene.name(), Console::drawing_style());
     let placing = spawn_blocking(move || {
-        let placed = wish.place(&text, &|path: &str| fs::read(folder.join(Path::new(path))));
+        let placed = request.place(&text, &|path: &str| fs::read(folder.join(Path::new(path))));
         let mut report = draw_diagnostics(&name, &text, &placed.diagnostics, style);
         report.extend(placed.omitted.summary());
         text.ensure_unchanged().map(|()| (placed.order, report))
@@ -298,9 +299,9 @@ async fn wait(job: &Job, console: &Console) -> Result<Duration, Failure> {
         {
             let progress = progress.borrow_and_update();
             bar.show(&progress);
-            match &progress.end {
-                Some(End::Finished(time)) => return Ok(*time),
-                Some(End::Failed(reason)) => return Err(Failure::Other(anyhow!("{reason}"))),
+            match &progress.outcome {
+                Some(Outcome::Finished(time)) => return Ok(*time),
+                Some(Outcome::Failed(reason)) => return Err(Failure::Other(anyhow!("{reason}"))),
                 None => {}
             }
         }

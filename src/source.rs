@@ -1,19 +1,21 @@
 //! The scene's text: long files are mapped, not copied.
 
 use std::{
+    collections::BTreeMap,
     fs::{self, File, Metadata},
     io::{self, Read},
     path::{Path, PathBuf},
+    sync::Mutex,
     time::SystemTime,
 };
 
 use anyhow::Context;
 use memmap2::Mmap;
-use rtfarm_coordinator::folder_of;
+use rtfarm_core::read::read_scene;
 use tokio::task::spawn_blocking;
 use tokio_util::sync::CancellationToken;
 
-use crate::{args::SceneArgs, failure::Failure};
+use crate::{args::SceneArgs, failure::Failure, output::folder_of};
 
 /// From here on a copy would count.
 const LONG: u64 = 16 << 20;
@@ -103,11 +105,46 @@ pub(crate) fn scene_folder(scene: &SceneArgs) -> PathBuf {
     if scene.is_from_stdin() { ".".into() } else { folder_of(&scene.path) }
 }
 
+/// The files that a scene names, by the names that it has for them. One that cannot be read is
+/// left out: the coordinator will miss it where the scene names it.
+pub(crate) fn read_named_files(text: &[u8], folder: &Path) -> BTreeMap<String, Vec<u8>> {
+    let read = |name: String| Some((fs::read(folder.join(&name)).ok()?, name));
+    referenced_files(text).into_iter().filter_map(read).map(|(data, name)| (name, data)).collect()
+}
+
+/// The names that a scene has for files: what its reader asks for, of which nothing is decoded.
+fn referenced_files(text: &[u8]) -> Vec<String> {
+    let names = Mutex::new(Vec::new());
+    read_scene(text, &|name: &str| {
+        names.lock().expect("nothing here panics").push(name.to_owned());
+        Err(io::ErrorKind::NotFound.into())
+    });
+    names.into_inner().expect("nothing here panics")
+}
+
 #[cfg(test)]
 mod tests {
     use std::io::Write;
 
     use super::*;
+
+    #[test]
+    fn every_file_that_a_scene_names_is_read_once_if_it_is_there() {
+        let folder = tempfile::tempdir().unwrap();
+        for name in ["wood.png", "teapot.obj", "unnamed.png"] {
+            fs::write(folder.path().join(name), name).unwrap();
+        }
+        let material = |name, texture| {
+            format!("entry\n name {name}\n color 1 1 1\n texture {texture}\nendentry\n")
+        };
+        let materials =
+            [material("a", "wood.png"), material("b", "wood.png"), material("c", "gone.png")];
+        let mesh = "geometry\nmesh\n file teapot.obj\n material a\nendmesh\nendgeometry\n";
+        let text = format!("materials\n{}endmaterials\n{mesh}", materials.concat());
+        let files = read_named_files(text.as_bytes(), folder.path());
+        let expected = ["teapot.obj", "wood.png"].map(|name| (name.to_owned(), name.into()));
+        assert_eq!(files, BTreeMap::from(expected));
+    }
 
     #[test]
     fn a_long_file_that_changes_is_refused() {

@@ -1,43 +1,42 @@
-//! `rtfarm submit`: a picture from a farm.
+//! `rtfarm submit`: a picture from a farm. It does what [`Submission`] decides, and tells it what
+//! came of it.
 
 use std::{
     collections::BTreeMap,
-    fs,
+    future::pending,
     io::{self, Write},
-    path::Path,
-    sync::Mutex,
-    time::Duration,
+    ops::ControlFlow,
+    panic::resume_unwind,
 };
 
-use anyhow::{Context, anyhow};
-use rtfarm_coordinator::{Progress, Wish};
-use rtfarm_core::{read::read_scene, tile::Size};
+use anyhow::Context;
+use rtfarm_core::{render::Tally, tile::Size};
+use rtfarm_job::Progress;
 use rtfarm_proto::{
-    CHUNK_BYTES, MESSAGE_BYTES, PROTOCOL,
-    wire::{self, event, jobs_client::JobsClient, submit_request::Part, submit_response::Outcome},
+    Address, CHUNK_BYTES, JobId, MESSAGE_BYTES, PROTOCOL, WireError,
+    wire::{self, event, jobs_client::JobsClient, submit_request::Part, submit_response},
 };
-use tokio::{sync::mpsc, task::spawn_blocking, time::Instant};
+use tokio::{
+    sync::mpsc,
+    task::{JoinHandle, spawn_blocking},
+    time::Instant,
+};
 use tokio_stream::wrappers::ReceiverStream;
 use tokio_util::sync::CancellationToken;
-use tonic::{Status, transport::Channel};
+use tonic::{Status, Streaming, transport::Channel};
 
 use crate::{
     VERSION,
     args::SubmitArgs,
-    console::Console,
+    console::{Bar, Console},
     failure::Failure,
     output::Output,
     render::Summary,
-    source::{SceneText, scene_folder},
+    source::{SceneText, read_named_files, scene_folder},
+    submission::{
+        Action, Finished, JobEnd, JobState, Submission, SubmitOutcome, Submitted, Trouble,
+    },
 };
-
-/// A scene may be large and take long to prepare.
-const SUBMIT_DEADLINE: Duration = Duration::from_secs(1800);
-
-/// Encoding a large picture takes a while.
-const IMAGE_DEADLINE: Duration = Duration::from_secs(600);
-
-const DEADLINE: Duration = Duration::from_secs(15);
 
 pub(crate) async fn run(
     args: SubmitArgs,
@@ -48,63 +47,273 @@ pub(crate) async fn run(
     let mut output = args.picture.output().map_err(Failure::Input)?;
     output.check()?;
     let text = SceneText::read(&args.picture.scene, stop).await?;
-    let channel = args.coordinator.connect().await;
-    let channel =
-        channel.with_context(|| format!("no coordinator answers at {}", args.coordinator))?;
-    let mut client = JobsClient::new(channel)
-        .max_decoding_message_size(MESSAGE_BYTES)
-        .max_encoding_message_size(MESSAGE_BYTES);
+    let mut submission = Submission::new(args.picture.scene.name(), now());
+    let mut shell = Shell {
+        args: &args,
+        output: &output,
+        console,
+        stop,
+        text: Some(text),
+        client: None,
+        reports: mpsc::channel(1).1,
+        running: None,
+        writing: None,
+        bar: None,
+    };
+    let ended = shell.follow(&mut submission).await;
+    shell.close().await;
 
-    let submitted = tokio::select! {
-        submitted = submit(&mut client, &args, &output, text, console) => submitted?,
-        () = stop.cancelled() => return Err(Failure::Interrupted),
-    };
-    let watched = tokio::select! {
-        watched = watch(client.clone(), submitted.job, console) => watched,
-        () = stop.cancelled() => Err(Failure::Interrupted),
-    };
-    let rendered = match watched {
-        Ok(watched) => fetch(client.clone(), submitted.job, &output, stop).await.map(|()| watched),
-        Err(failure) => Err(failure),
-    };
-    let cancelled = client.cancel(wire::CancelRequest { job: submitted.job });
-    let _ = tokio::time::timeout(DEADLINE, cancelled).await;
-    let size = Size::try_from(submitted.frame.context("the coordinator names no size")?)?;
-    let (event, rendering) = rendered?;
-    let tally = event.tally.unwrap_or_default().try_into()?;
-    let workers = event.workers as usize;
-    let Wish { quality, transfer, .. } = args.picture.wish(output.format());
-    let sampling = quality.sampling;
+    let Finished { size, tally, worker_count, rendering } = ended?;
+    let request = args.picture.request(output.format());
+    let (sampling, transfer) = (request.quality.sampling, request.transfer);
+    let workers = worker_count as usize;
     Summary { size, tally, sampling, transfer, rendering, workers }.tell(started, &output)?;
     Ok(())
 }
 
-async fn submit(
-    client: &mut JobsClient<Channel>,
-    args: &SubmitArgs,
-    output: &Output,
-    text: SceneText,
-    console: &Console,
-) -> Result<wire::Accepted, Failure> {
-    let wish = args.picture.wish(output.format());
-    let order = wire::Order {
-        version: VERSION.to_owned(),
-        protocol: PROTOCOL,
-        name: wish.name.clone(),
-        frame: wish.size.map(Into::into),
-        quality: Some(wish.quality.into()),
-        strict: wish.strict,
-        tile_side: wish.tile_side.map_or(0, |side| side as u32),
-        format: wire::Format::from(wish.format).into(),
-        transfer: wire::Transfer::from(wish.transfer).into(),
+fn now() -> std::time::Instant {
+    Instant::now().into_std()
+}
+
+/// Waits for a moment; for ever when there is none.
+async fn sleep_until(moment: Option<std::time::Instant>) {
+    match moment {
+        Some(moment) => tokio::time::sleep_until(Instant::from_std(moment)).await,
+        None => pending().await,
+    }
+}
+
+/// What is being done, and what it needs.
+struct Shell<'a> {
+    args: &'a SubmitArgs,
+    output: &'a Output,
+    console: &'a Console,
+    stop: &'a CancellationToken,
+    /// The scene's text until it is sent.
+    text: Option<SceneText>,
+    client: Option<JobsClient<Channel>>,
+    /// What the running task tells.
+    reports: mpsc::Receiver<Report>,
+    running: Option<JoinHandle<()>>,
+    /// The thread that writes the picture.
+    writing: Option<JoinHandle<()>>,
+    bar: Option<Bar>,
+}
+
+/// What a task tells.
+enum Report {
+    Connected(JobsClient<Channel>),
+    Submitted(Submitted),
+    Watching,
+    JobState(JobState),
+    ChunkAwaited,
+    Chunk,
+    Fetched,
+    Cancelled,
+    Trouble(Trouble),
+}
+
+impl Shell<'_> {
+    /// Does what is decided, to the end.
+    async fn follow(&mut self, submission: &mut Submission) -> Result<Finished, Failure> {
+        let stop = self.stop;
+        let mut is_stopped = false;
+        loop {
+            while let Some(action) = submission.next_action() {
+                if let ControlFlow::Break(end) = self.execute(action) {
+                    return end;
+                }
+            }
+            let wake_at = submission.wake_at();
+            tokio::select! {
+                // An interruption goes first: others may be its consequences.
+                biased;
+                () = stop.cancelled(), if !is_stopped => {
+                    is_stopped = true;
+                    submission.on_stop(now());
+                }
+                report = self.next_report() => self.pass_on(report, submission),
+                () = sleep_until(wake_at) => submission.on_tick(now()),
+            }
+        }
+    }
+
+    /// Waits until the picture's file is whole or removed.
+    async fn close(&mut self) {
+        self.end_task();
+        if let Some(writing) = self.writing.take() {
+            let _ = writing.await;
+        }
+    }
+
+    fn execute(&mut self, action: Action) -> ControlFlow<Result<Finished, Failure>> {
+        match action {
+            Action::Connect => {
+                let address = self.args.coordinator.clone();
+                self.start(|reports| connect(address, reports));
+            }
+            Action::Submit => {
+                let order = self.order();
+                let (client, text) = (self.client(), self.text.take().expect("it is sent once"));
+                let (folder, name) =
+                    (scene_folder(&self.args.picture.scene), self.args.picture.scene.name());
+                self.start(|reports| async move {
+                    let files = spawn_blocking(move || {
+                        let files = read_named_files(&text, &folder);
+                        text.ensure_unchanged().map(|()| (text, files))
+                    });
+                    let report = match files.await.expect("reading never panics") {
+                        Ok((text, files)) => submit(client, order, text, files).await,
+                        Err(error) => {
+                            let reason = format!("cannot read the scene {name}: {error}");
+                            Report::Trouble(Trouble::File(reason))
+                        }
+                    };
+                    let _ = reports.send(report).await;
+                });
+            }
+            Action::TellReport(report) => self.console.tell_report(&report),
+            Action::Watch(job) => {
+                let client = self.client();
+                self.start(|reports| watch(client, job, reports));
+            }
+            Action::Show(state) => self.show(&state),
+            Action::WarnOfDifferingTiles(tiles) => {
+                self.bar = None;
+                tracing::warn!(
+                    tiles,
+                    "two workers rendered the same tile differently; one of them is broken"
+                );
+            }
+            Action::Fetch(job) => {
+                let (send, chunks) = mpsc::channel(2);
+                let client = self.client();
+                let reports = self.start(|reports| fetch(client, job, send, reports));
+                self.writing = Some(write(self.output.clone(), self.stop.clone(), chunks, reports));
+            }
+            Action::Cancel(job) => {
+                let mut client = self.client();
+                self.start(|reports| async move {
+                    let request = wire::CancelRequest { job: job.0 };
+                    let cancelled = client.cancel(request).await;
+                    let report =
+                        cancelled.map_or_else(|status| failed(&status), |_| Report::Cancelled);
+                    let _ = reports.send(report).await;
+                });
+            }
+            Action::End(end) => {
+                self.bar = None;
+                return ControlFlow::Break(end);
+            }
+        }
+        ControlFlow::Continue(())
+    }
+
+    /// Ends the running task and starts another. Answers with where it tells its reports.
+    fn start<F>(&mut self, task: impl FnOnce(mpsc::Sender<Report>) -> F) -> mpsc::Sender<Report>
+    where
+        F: Future<Output = ()> + Send + 'static,
+    {
+        self.end_task();
+        self.bar = None;
+        let (send, receive) = mpsc::channel(1);
+        self.reports = receive;
+        self.running = Some(tokio::spawn(task(send.clone())));
+        send
+    }
+
+    fn end_task(&mut self) {
+        self.reports.close();
+        if let Some(running) = self.running.take() {
+            running.abort();
+        }
+    }
+
+    async fn next_report(&mut self) -> Report {
+        if let Some(report) = self.reports.recv().await {
+            return report;
+        }
+        // A task that has nothing more to tell has told what ends it, or has panicked.
+        if let Some(running) = self.running.take()
+            && let Err(error) = running.await
+            && error.is_panic()
+        {
+            resume_unwind(error.into_panic());
+        }
+        pending().await
+    }
+
+    fn pass_on(&mut self, report: Report, submission: &mut Submission) {
+        match report {
+            Report::Connected(client) => {
+                self.client = Some(client);
+                submission.on_connected(now());
+            }
+            Report::Submitted(submitted) => submission.on_submitted(submitted, now()),
+            Report::Watching => submission.on_watching(),
+            Report::JobState(state) => submission.on_job_state(state, now()),
+            Report::ChunkAwaited => submission.on_chunk_awaited(now()),
+            Report::Chunk => submission.on_chunk(),
+            Report::Fetched => submission.on_fetched(now()),
+            Report::Cancelled => submission.on_cancelled(),
+            Report::Trouble(trouble) => submission.on_trouble(trouble, now()),
+        }
+    }
+
+    fn client(&self) -> JobsClient<Channel> {
+        self.client.clone().expect("a submission connects first")
+    }
+
+    fn show(&mut self, state: &JobState) {
+        let bar = self.bar.get_or_insert_with(|| self.console.start_bar(state.tile_count));
+        bar.show(&Progress {
+            tiles_done: state.tiles_done,
+            tile_count: state.tile_count,
+            tally: state.tally,
+            ..Progress::default()
+        });
+        tracing::debug!(done = state.tiles_done, count = state.tile_count, "progress");
+    }
+
+    fn order(&self) -> wire::Order {
+        let request = self.args.picture.request(self.output.format());
+        wire::Order {
+            version: VERSION.to_owned(),
+            protocol: PROTOCOL,
+            name: request.name,
+            frame: request.size.map(Into::into),
+            quality: Some(request.quality.into()),
+            strict: request.strict,
+            tile_side: request.tile_side.map_or(0, |side| side as u32),
+            format: wire::Format::from(request.format).into(),
+            transfer: wire::Transfer::from(request.transfer).into(),
+        }
+    }
+}
+
+fn failed(status: &Status) -> Report {
+    Report::Trouble(Trouble::Call(status.message().to_owned()))
+}
+
+async fn connect(address: Address, reports: mpsc::Sender<Report>) {
+    let channel = address.connect().await;
+    let report = match channel.map_err(anyhow::Error::from) {
+        Ok(channel) => Report::Connected(
+            JobsClient::new(channel)
+                .max_decoding_message_size(MESSAGE_BYTES)
+                .max_encoding_message_size(MESSAGE_BYTES),
+        ),
+        Err(error) => Report::Trouble(Trouble::Connect(address, format!("{error:#}"))),
     };
-    let folder = scene_folder(&args.picture.scene);
-    let (text, files) = spawn_blocking(move || {
-        let files = named_files(&text, &folder);
-        text.ensure_unchanged().map(|()| (text, files))
-    })
-    .await?
-    .with_context(|| format!("cannot read the scene {}", args.picture.scene.name()))?;
+    let _ = reports.send(report).await;
+}
+
+async fn submit(
+    mut client: JobsClient<Channel>,
+    order: wire::Order,
+    text: SceneText,
+    files: BTreeMap<String, Vec<u8>>,
+) -> Report {
     let (send, parts) = mpsc::channel(2);
     tokio::spawn(async move {
         let pieces = text.chunks(CHUNK_BYTES).map(|piece| Part::Text(piece.to_vec().into()));
@@ -123,122 +332,129 @@ async fn submit(
             }
         }
     });
-    let submitting = client.submit(ReceiverStream::new(parts));
-    let answer = within(SUBMIT_DEADLINE, submitting).await?.into_inner();
-    console.tell_report(&answer.report);
-    match answer.outcome {
-        Some(Outcome::Accepted(accepted)) => Ok(accepted),
-        Some(Outcome::Refused(reason)) if reason.is_empty() => Err(Failure::Told),
-        Some(Outcome::Refused(reason)) => {
-            Err(Failure::Input(anyhow!("the farm cannot render {}: {reason}", wish.name)))
-        }
-        None => Err(Failure::Other(anyhow!("the coordinator's answer makes no sense"))),
+    match client.submit(ReceiverStream::new(parts)).await {
+        Ok(answer) => match read_submitted(answer.into_inner()) {
+            Ok(submitted) => Report::Submitted(submitted),
+            Err(error) => nonsense(&error),
+        },
+        Err(status) => failed(&status),
     }
 }
 
-/// The files that a scene names, by the names that it has for them. One that cannot be read is
-/// left out: the coordinator will miss it where the scene names it.
-fn named_files(text: &[u8], folder: &Path) -> BTreeMap<String, Vec<u8>> {
-    let files = Mutex::new(BTreeMap::new());
-    read_scene(text, &|path: &str| {
-        let data = fs::read(folder.join(path))?;
-        files.lock().expect("nothing here panics").insert(path.to_owned(), data.clone());
-        Ok(data)
-    });
-    files.into_inner().expect("nothing here panics")
-}
-
-/// Waits for the job's end. Answers with the last event and the time that the rendering took.
-async fn watch(
-    mut client: JobsClient<Channel>,
-    job: u64,
-    console: &Console,
-) -> Result<(wire::Event, Duration), Failure> {
-    let mut events = within(DEADLINE, client.watch(wire::WatchRequest { job })).await?.into_inner();
-    let mut bar = None;
-    let (last, seconds) = loop {
-        let event = events.message().await.map_err(|status| describe(&status))?;
-        let event = event.context("the coordinator is gone")?;
-        bar.get_or_insert_with(|| console.start_bar(event.tile_count)).show(&Progress {
-            tiles_done: event.tiles_done,
-            tile_count: event.tile_count,
-            tally: event.tally.and_then(|tally| tally.try_into().ok()).unwrap_or_default(),
-            ..Progress::default()
-        });
-        tracing::debug!(done = event.tiles_done, count = event.tile_count, "progress");
-        match &event.end {
-            Some(event::End::Finished(finished)) => {
-                let seconds = finished.seconds;
-                break (event, seconds);
-            }
-            Some(event::End::Failed(reason)) => {
-                return Err(Failure::Other(anyhow!("the farm failed: {reason}")));
-            }
-            None => {}
-        }
+/// Tells of a job until there is nothing more to tell.
+async fn watch(mut client: JobsClient<Channel>, job: JobId, reports: mpsc::Sender<Report>) {
+    let trouble = match client.watch(wire::WatchRequest { job: job.0 }).await {
+        Ok(events) => tell_events(events.into_inner(), &reports).await,
+        Err(status) => failed(&status),
     };
-    drop(bar);
-    if last.differing_tiles > 0 {
-        tracing::warn!(
-            tiles = last.differing_tiles,
-            "two workers rendered the same tile differently; one of them is broken"
-        );
-    }
-    Ok((last, Duration::try_from_secs_f64(seconds)?))
+    let _ = reports.send(trouble).await;
 }
 
-/// Brings a finished job's picture.
+/// Returns with what ends the stream of events.
+async fn tell_events(mut events: Streaming<wire::Event>, reports: &mpsc::Sender<Report>) -> Report {
+    let mut report = Report::Watching;
+    loop {
+        if reports.send(report).await.is_err() {
+            return Report::Trouble(Trouble::Gone);
+        }
+        report = match events.message().await {
+            Ok(Some(event)) => match read_event(event) {
+                Ok(state) => Report::JobState(state),
+                Err(error) => return nonsense(&error),
+            },
+            Ok(None) => return Report::Trouble(Trouble::Gone),
+            Err(status) => return failed(&status),
+        };
+    }
+}
+
+/// Brings a finished job's picture and hands it on, piece by piece.
 async fn fetch(
     mut client: JobsClient<Channel>,
-    job: u64,
-    output: &Output,
-    stop: &CancellationToken,
-) -> Result<(), Failure> {
-    let asking = within(IMAGE_DEADLINE, client.image(wire::ImageRequest { job }));
-    let mut chunks = tokio::select! {
-        chunks = asking => chunks?.into_inner(),
-        () = stop.cancelled() => return Err(Failure::Interrupted),
+    job: JobId,
+    send: mpsc::Sender<wire::Chunk>,
+    reports: mpsc::Sender<Report>,
+) {
+    let mut chunks = match client.image(wire::ImageRequest { job: job.0 }).await {
+        Ok(chunks) => chunks.into_inner(),
+        Err(status) => {
+            let _ = reports.send(failed(&status)).await;
+            return;
+        }
     };
-    let (send, mut received) = mpsc::channel::<wire::Chunk>(2);
-    let (output, token) = (output.clone(), stop.clone());
-    let writing = spawn_blocking(move || {
-        output.write(&token, |file| {
+    loop {
+        let _ = reports.send(Report::ChunkAwaited).await;
+        let chunk = match chunks.message().await {
+            Ok(chunk) => chunk,
+            Err(status) => {
+                let _ = reports.send(failed(&status)).await;
+                return;
+            }
+        };
+        let _ = reports.send(Report::Chunk).await;
+        // The last chunk is empty: a stream that is cut short has none.
+        let is_last = chunk.is_none();
+        if send.send(chunk.unwrap_or_default()).await.is_err() || is_last {
+            return;
+        }
+    }
+}
+
+/// Writes the picture as its pieces come, on a thread of its own.
+fn write(
+    output: Output,
+    stop: CancellationToken,
+    mut chunks: mpsc::Receiver<wire::Chunk>,
+    reports: mpsc::Sender<Report>,
+) -> JoinHandle<()> {
+    spawn_blocking(move || {
+        let written = output.write(&stop, |file| {
             let mut is_whole = false;
-            while let Some(chunk) = received.blocking_recv() {
-                // The last chunk is empty: a stream that is cut short has none.
+            while let Some(chunk) = chunks.blocking_recv() {
                 is_whole = chunk.data.is_empty();
                 file.write_all(&chunk.data)?;
             }
             if is_whole { Ok(()) } else { Err(io::Error::other("the picture was cut short")) }
-        })
-    });
-    let receiving = async move {
-        loop {
-            let chunk = tokio::select! {
-                chunk = within(DEADLINE * 2, chunks.message()) => chunk?,
-                () = stop.cancelled() => return Err(Failure::Interrupted),
-            };
-            let is_last = chunk.is_none();
-            if send.send(chunk.unwrap_or_default()).await.is_err() || is_last {
-                return Ok(());
-            }
-        }
+        });
+        let report = match written {
+            Ok(()) => Report::Fetched,
+            Err(error) => Report::Trouble(Trouble::File(format!("{error:#}"))),
+        };
+        // Nobody listens when the submission has gone on without the picture.
+        let _ = reports.blocking_send(report);
+    })
+}
+
+/// An answer that cannot be understood.
+fn nonsense(error: &anyhow::Error) -> Report {
+    Report::Trouble(Trouble::Nonsense(format!("{error:#}")))
+}
+
+fn read_submitted(answer: wire::SubmitResponse) -> anyhow::Result<Submitted> {
+    let outcome = match answer.outcome.context("it has no outcome")? {
+        submit_response::Outcome::Accepted(accepted) => SubmitOutcome::Accepted {
+            job: JobId(accepted.job),
+            size: Size::try_from(accepted.frame.ok_or(WireError::Missing("frame"))?)?,
+        },
+        submit_response::Outcome::Refused(reason) => SubmitOutcome::Refused(reason),
     };
-    let (received, written) = tokio::join!(receiving, writing);
-    received?;
-    Ok(written??)
+    Ok(Submitted { outcome, report: answer.report })
 }
 
-async fn within<T>(
-    deadline: Duration,
-    call: impl Future<Output = Result<T, Status>>,
-) -> Result<T, Failure> {
-    match tokio::time::timeout(deadline, call).await {
-        Ok(answer) => answer.map_err(|status| describe(&status)),
-        Err(_) => Err(Failure::Other(anyhow!("the coordinator does not answer"))),
-    }
-}
-
-fn describe(status: &Status) -> Failure {
-    Failure::Other(anyhow!("the coordinator says: {}", status.message()))
+fn read_event(event: wire::Event) -> anyhow::Result<JobState> {
+    let end = match event.end {
+        Some(event::End::Finished(finished)) => {
+            Some(JobEnd::Finished(std::time::Duration::try_from_secs_f64(finished.seconds)?))
+        }
+        Some(event::End::Failed(reason)) => Some(JobEnd::Failed(reason)),
+        None => None,
+    };
+    Ok(JobState {
+        tiles_done: event.tiles_done,
+        tile_count: event.tile_count,
+        tally: Tally::try_from(event.tally.unwrap_or_default())?,
+        worker_count: event.workers,
+        differing_tiles: event.differing_tiles,
+        end,
+    })
 }

@@ -15,7 +15,6 @@ use image::{ImageBuffer, Rgb};
 use rayon::prelude::*;
 use rtfarm_core::{
     isa::Isa,
-    picture::{Picture, PictureFormat},
     prepare::prepare,
     prepared::PreparedScene,
     read::read_scene,
@@ -23,6 +22,7 @@ use rtfarm_core::{
     tile::{Area, Size},
     transfer::Transfer,
 };
+use rtfarm_picture::{Picture, PictureFormat};
 
 type Image = ImageBuffer<Rgb<u16>, Vec<u16>>;
 
@@ -55,12 +55,15 @@ fn render(name: &str) -> Vec<u8> {
     let prepared = PreparedScene::open(prepare(&scene).unwrap()).unwrap();
     let viewport = scene.viewport.unwrap();
     let size = small(scene.size_hint.unwrap_or_else(|| viewport.default_size()));
-    let settings =
-        Settings { size, quality: Quality { sampling: Sampling::Fixed(8), ..Quality::default() } };
-    let area = Area { x0: 0, y0: 0, width: size.width(), height: size.height() };
+    let settings = Settings {
+        size,
+        quality: Quality { sampling: Sampling::fixed(8).unwrap(), ..Quality::default() },
+    };
+    let area = Area::whole(size);
 
     let render = |isa| {
-        render_tile(&prepared, &settings, area, isa, &mut || ControlFlow::Continue(())).unwrap()
+        render_tile(&prepared, &settings.quality, area, isa, &mut || ControlFlow::Continue(()))
+            .unwrap()
     };
     let tile = render(Isa::Scalar);
     for isa in Isa::ALL.into_iter().filter(|isa| isa.is_supported()) {

@@ -1,14 +1,10 @@
-//! A job: its scene, its picture, how far it is.
+//! What the shell keeps of a job: its scene, its picture, and how far it is for those who watch.
 
-use std::{collections::BTreeSet, time::Duration};
-
-use rtfarm_core::{
-    picture::Picture,
-    render::{Settings, Tally},
-    tile::TileGrid,
-};
-use rtfarm_proto::{JobId, WorkerId};
-use tokio::{sync::watch, time::Instant};
+use rtfarm_core::{render::Settings, tile::TileGrid};
+use rtfarm_job::Progress;
+use rtfarm_picture::Picture;
+use rtfarm_proto::JobId;
+use tokio::sync::watch;
 
 use crate::store::SceneFile;
 
@@ -16,39 +12,11 @@ use crate::store::SceneFile;
 #[derive(Debug)]
 pub struct Job {
     pub(crate) id: JobId,
-    pub(crate) name: String,
     pub(crate) scene: SceneFile,
     pub(crate) settings: Settings,
     pub(crate) grid: TileGrid,
     pub(crate) picture: Picture,
-    pub(crate) started: Instant,
     pub(crate) progress: watch::Sender<Progress>,
-}
-
-/// How far a job is.
-#[derive(Debug, Clone, Default)]
-pub struct Progress {
-    /// Tiles in the picture.
-    pub tiles_done: u32,
-    /// Tiles of the picture.
-    pub tile_count: u32,
-    /// What the tiles in the picture took.
-    pub tally: Tally,
-    /// Workers that brought some of them.
-    pub workers: BTreeSet<WorkerId>,
-    /// Tiles of which two copies differed.
-    pub differing_tiles: u32,
-    /// How it ended, once it has.
-    pub end: Option<End>,
-}
-
-/// How a job ended.
-#[derive(Debug, Clone, PartialEq)]
-pub enum End {
-    /// Every tile is in the picture, after that time.
-    Finished(Duration),
-    /// It will never be.
-    Failed(String),
 }
 
 impl Job {
@@ -67,12 +35,40 @@ impl Job {
         self.progress.subscribe()
     }
 
-    /// Ends the job, unless it has ended; says whether it had not.
-    pub(crate) fn end(&self, end: End) -> bool {
-        self.progress.send_if_modified(|progress| {
-            let is_first = progress.end.is_none();
-            progress.end.get_or_insert(end);
-            is_first
-        })
+    /// Shows how far it is. Threads may bring the states out of order: one that is older than
+    /// what is shown already is not shown.
+    pub(crate) fn publish(&self, progress: Progress) {
+        self.progress.send_if_modified(|shown| replace_older(shown, progress));
+    }
+}
+
+/// Replaces an older state of a job; says whether it was older.
+fn replace_older(shown: &mut Progress, progress: Progress) -> bool {
+    // Each of these only grows, and one of them does with every change.
+    let age = |progress: &Progress| {
+        (progress.outcome.is_some(), progress.tiles_done, progress.differing_tiles)
+    };
+    let is_older = age(shown) < age(&progress);
+    if is_older {
+        *shown = progress;
+    }
+    is_older
+}
+
+#[cfg(test)]
+mod tests {
+    use rtfarm_job::Outcome;
+
+    use super::*;
+
+    #[test]
+    fn a_state_that_comes_late_is_not_shown() {
+        let state = |tiles_done, outcome| Progress { tiles_done, outcome, ..Progress::default() };
+        let mut shown = state(1, None);
+        assert!(replace_older(&mut shown, state(3, None)));
+        assert!(!replace_older(&mut shown, state(2, None)));
+        assert!(replace_older(&mut shown, state(3, Some(Outcome::Failed(String::new())))));
+        assert!(!replace_older(&mut shown, state(4, None)), "the end is the last to be shown");
+        assert_eq!(shown.tiles_done, 3);
     }
 }

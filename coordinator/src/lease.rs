@@ -1,15 +1,16 @@
-//! Who renders which tile of one job. Decisions alone: time is an argument, nothing waits.
+//! Who renders which tiles of which job, and until when. Decisions alone: time is an argument,
+//! nothing waits. A lease ends when its last tile has come, when it runs out, when its worker is
+//! lost and when its job ends.
 
 use std::{
     collections::{BTreeMap, BTreeSet},
     time::{Duration, Instant},
 };
 
-use rtfarm_core::tile::{TileGrid, TileId};
-use rtfarm_proto::{Epoch, WorkerId};
+use rtfarm_core::tile::TileId;
+use rtfarm_proto::{JobId, LeaseId, LeaseName, WorkerId};
 
-/// A finished tile's BLAKE3 hash.
-pub(crate) type PixelHash = [u8; 32];
+use crate::tiles::{Arrival, PixelHash, Place, Tiles};
 
 /// The longest run of tiles in one lease: a lost worker costs no more than its rendering.
 const LONGEST_RUN: usize = 64;
@@ -20,340 +21,469 @@ const RUNS_PER_THREAD: usize = 2;
 
 /// A lease from which no tile came for this long has its tiles rendered a second time, once
 /// nothing else is left to do.
-const SLOW: Duration = Duration::from_millis(400);
+const QUIET: Duration = Duration::from_millis(400);
 
-/// The leases of one job's tiles. Invariants: a tile that is `Done` stays so; a tile is in `free`
-/// exactly while it is neither done nor in a lease; each lease has one entry in `expiries`.
+/// The leases of all jobs that are being rendered, and those jobs' tiles. Invariants: a lease
+/// holds at least one tile, and all its tiles are open; each lease has one entry in `expiries`,
+/// `by_worker` and `by_job`, and one in `last_tiles` exactly while it holds a tile alone;
+/// `with_free` has exactly the jobs with a free tile.
 #[derive(Debug)]
 pub(crate) struct Leases {
-    grid: TileGrid,
     term: Duration,
-    /// Every tile in the order of rendering; the index is the tile's place.
-    order: Vec<TileId>,
-    /// By tile number.
-    tiles: Vec<Tile>,
-    /// The places of free tiles.
-    free: BTreeSet<u32>,
-    held: BTreeMap<Epoch, Lease>,
-    expiries: BTreeSet<(Instant, Epoch)>,
-}
-
-#[derive(Debug, Clone, Copy)]
-enum Tile {
-    /// In so many leases; free when in none.
-    Open { place: u32, leases: u8 },
-    /// Its first pixels had this hash.
-    Done(PixelHash),
+    last_id: LeaseId,
+    jobs: BTreeMap<JobId, Tiles>,
+    with_free: BTreeSet<JobId>,
+    held: BTreeMap<LeaseId, Lease>,
+    expiries: BTreeSet<(Instant, LeaseId)>,
+    last_tiles: BTreeSet<(Instant, LeaseId)>,
+    by_worker: BTreeSet<(WorkerId, LeaseId)>,
+    by_job: BTreeSet<(JobId, LeaseId)>,
 }
 
 #[derive(Debug)]
 struct Lease {
+    job: JobId,
     worker: WorkerId,
-    /// Tiles not yet done, by place.
-    tiles: BTreeSet<u32>,
+    /// Tiles that are in no other lease.
+    alone: BTreeSet<Place>,
+    /// Tiles that another lease holds too.
+    shared: BTreeSet<Place>,
     until: Instant,
     /// When the lease began, or the last tile under it came.
     last_tile: Instant,
 }
 
-/// A run of tiles for a worker.
+/// A run of tiles for a worker, in the order of rendering.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct Run {
-    pub(crate) epoch: Epoch,
+    pub(crate) lease: LeaseName,
     pub(crate) tiles: Vec<TileId>,
-}
-
-/// What a worker gets when no tile is free.
-#[derive(Debug, PartialEq, Eq)]
-pub(crate) enum Again {
-    /// A tile that another worker has been silent about.
-    Render(Run),
-    /// Nothing now; perhaps then, or when something changes.
-    Wait(Option<Instant>),
-}
-
-/// What is to be done with pixels that came.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Verdict {
-    /// They are the tile's first.
-    Stitch,
-    /// The same as the first.
-    Duplicate,
-    /// Not the same as the first, which were these: something is broken.
-    Differs(PixelHash),
 }
 
 /// A lease that its worker no longer has.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct Loss {
+    pub(crate) lease: LeaseName,
     pub(crate) worker: WorkerId,
-    pub(crate) epoch: Epoch,
     /// The tiles that had not come, in the order of rendering.
     pub(crate) tiles: Vec<TileId>,
 }
 
 impl Leases {
-    /// All tiles of `grid`, free; leases live for `term` after the last sign of progress.
-    pub(crate) fn new(grid: TileGrid, term: Duration) -> Self {
-        let order = grid.render_order();
-        let mut tiles = vec![Tile::Done([0; 32]); order.len()];
-        for (place, tile) in (0..).zip(&order) {
-            tiles[tile.index()] = Tile::Open { place, leases: 0 };
+    /// Makes the leases of a farm without jobs. One lives for `term` after the last progress.
+    pub(crate) fn new(term: Duration) -> Self {
+        Self {
+            term,
+            last_id: LeaseId(0),
+            jobs: BTreeMap::new(),
+            with_free: BTreeSet::new(),
+            held: BTreeMap::new(),
+            expiries: BTreeSet::new(),
+            last_tiles: BTreeSet::new(),
+            by_worker: BTreeSet::new(),
+            by_job: BTreeSet::new(),
         }
-        let free = (0..grid.count()).collect();
-        Self { grid, term, order, tiles, free, held: BTreeMap::new(), expiries: BTreeSet::new() }
     }
 
-    /// The tiles that there are.
-    pub(crate) fn grid(&self) -> TileGrid {
-        self.grid
+    /// The tiles of a job, as long as it is rendered.
+    pub(crate) fn tiles(&self, job: JobId) -> Option<&Tiles> {
+        self.jobs.get(&job)
     }
 
-    /// Event: `worker`, with `threads` of the farm's `all_threads`, has nothing to do and would
-    /// take up to `most` tiles, under a lease named `epoch`. `None` when no tile is free.
+    /// When the next lease runs out.
+    pub(crate) fn next_expiry(&self) -> Option<Instant> {
+        self.expiries.first().map(|&(until, _)| until)
+    }
+
+    /// Leases of which a tile may be rendered a second time, the quietest first: from when on, and
+    /// whose it is.
+    pub(crate) fn quietest(&self) -> impl Iterator<Item = (Instant, WorkerId, LeaseId)> {
+        let of = |&(last_tile, id)| (last_tile + QUIET, self.held[&id].worker, id);
+        self.last_tiles.iter().map(of)
+    }
+
+    /// Event: a job is to be rendered, of which all tiles are free.
+    pub(crate) fn on_submit(&mut self, job: JobId, tiles: Tiles) {
+        self.jobs.insert(job, tiles);
+        self.with_free.insert(job);
+    }
+
+    /// Event: nobody is to render a job any longer.
+    pub(crate) fn on_end(&mut self, job: JobId) {
+        let of_job = (job, LeaseId(0))..=(job, LeaseId(u64::MAX));
+        let ended: Vec<LeaseId> = self.by_job.range(of_job).map(|&(_, id)| id).collect();
+        for id in ended {
+            self.remove(id);
+        }
+        self.jobs.remove(&job);
+        self.with_free.remove(&job);
+    }
+
+    /// Event: `worker`, with `threads` of the farm's `all_threads`, would render up to `most` free
+    /// tiles. It gets some of the earliest job that has any.
     pub(crate) fn on_idle(
         &mut self,
         worker: WorkerId,
         (threads, all_threads): (usize, usize),
         most: usize,
-        epoch: Epoch,
         now: Instant,
     ) -> Option<Run> {
-        let shared_out = self.free.len() * threads / (RUNS_PER_THREAD * all_threads.max(1));
+        let &job = self.with_free.first()?;
+        let tiles = self.jobs.get_mut(&job)?;
+        let shared_out = tiles.free_count() * threads / (RUNS_PER_THREAD * all_threads.max(1));
         let count = shared_out.clamp(1, LONGEST_RUN).min(most.max(1));
-        let places: BTreeSet<u32> = self.free.iter().copied().take(count).collect();
-        (!places.is_empty()).then(|| self.grant(worker, places, epoch, now))
+        self.last_id.0 += 1;
+        let places = tiles.take_free(count, self.last_id);
+        if tiles.free_count() == 0 {
+            self.with_free.remove(&job);
+        }
+        Some(self.grant(worker, job, (places, BTreeSet::new()), now))
     }
 
-    /// Event: as [`Leases::on_idle`], and no job has a free tile: `worker` may render one a second
-    /// time. It is the last tile, which its holder comes to last, of the lease that has been
-    /// silent for longest.
+    /// Event: `worker` would render a tile of the lease `quiet` a second time. It gets the last
+    /// one that is in no other lease, since the holder comes to that last.
     pub(crate) fn on_idle_at_the_end(
         &mut self,
         worker: WorkerId,
-        epoch: Epoch,
+        quiet: LeaseId,
         now: Instant,
-    ) -> Again {
-        let slowest = self
-            .held
-            .values()
-            .filter(|lease| lease.worker != worker)
-            .filter_map(|lease| {
-                let once = |place: &&u32| self.lease_count(**place) == 1;
-                Some((lease.last_tile + SLOW, *lease.tiles.iter().rev().find(once)?))
-            })
-            .min();
-        match slowest {
-            Some((is_slow_at, place)) if is_slow_at <= now => {
-                Again::Render(self.grant(worker, BTreeSet::from([place]), epoch, now))
-            }
-            slowest => Again::Wait(slowest.map(|(is_slow_at, _)| is_slow_at)),
+    ) -> Option<Run> {
+        let lease = self.held.get_mut(&quiet)?;
+        let place = lease.alone.pop_last()?;
+        lease.shared.insert(place);
+        let job = lease.job;
+        if lease.alone.is_empty() {
+            self.last_tiles.remove(&(lease.last_tile, quiet));
         }
+        self.last_id.0 += 1;
+        self.jobs.get_mut(&job)?.share(place, self.last_id);
+        Some(self.grant(worker, job, (BTreeSet::new(), BTreeSet::from([place])), now))
     }
 
+    /// Enters a lease with the last number given; its tiles know of it already.
     fn grant(
         &mut self,
         worker: WorkerId,
-        places: BTreeSet<u32>,
-        epoch: Epoch,
+        job: JobId,
+        (alone, shared): (BTreeSet<Place>, BTreeSet<Place>),
         now: Instant,
     ) -> Run {
-        for &place in &places {
-            self.free.remove(&place);
-            *self.lease_count_mut(place) += 1;
-        }
-        let tiles = places.iter().map(|&place| self.order[place as usize]).collect();
+        let id = self.last_id;
+        let tiles = &self.jobs[&job];
+        let run = Run {
+            lease: LeaseName { job, id },
+            tiles: tiles.at(if alone.is_empty() { &shared } else { &alone }),
+        };
         let until = now + self.term;
-        self.held.insert(epoch, Lease { worker, tiles: places, until, last_tile: now });
-        self.expiries.insert((until, epoch));
-        Run { epoch, tiles }
-    }
-
-    fn lease_count(&self, place: u32) -> u8 {
-        match self.tiles[self.order[place as usize].index()] {
-            Tile::Open { leases, .. } => leases,
-            Tile::Done(_) => 0,
+        self.expiries.insert((until, id));
+        self.by_worker.insert((worker, id));
+        self.by_job.insert((job, id));
+        if !alone.is_empty() {
+            self.last_tiles.insert((now, id));
         }
+        self.held.insert(id, Lease { job, worker, alone, shared, until, last_tile: now });
+        run
     }
 
-    fn lease_count_mut(&mut self, place: u32) -> &mut u8 {
-        match &mut self.tiles[self.order[place as usize].index()] {
-            Tile::Open { leases, .. } => leases,
-            Tile::Done(_) => unreachable!("a tile that is done is in no lease"),
-        }
-    }
-
-    /// Event: `worker` goes on rendering under `epoch`. Says whether the lease still is its own.
-    pub(crate) fn on_progress(&mut self, worker: WorkerId, epoch: Epoch, now: Instant) -> bool {
-        match self.held.get_mut(&epoch) {
-            Some(lease) if lease.worker == worker => {
-                self.expiries.remove(&(lease.until, epoch));
+    /// Event: `worker` goes on rendering under `lease`. Says whether it still has that lease.
+    pub(crate) fn on_progress(&mut self, worker: WorkerId, name: LeaseName, now: Instant) -> bool {
+        match self.held.get_mut(&name.id) {
+            Some(lease) if lease.worker == worker && lease.job == name.job => {
+                self.expiries.remove(&(lease.until, name.id));
                 lease.until = now + self.term;
-                self.expiries.insert((lease.until, epoch));
+                self.expiries.insert((lease.until, name.id));
                 true
             }
             _ => false,
         }
     }
 
-    /// Event: pixels of `tile` came. Tiles are deterministic: the first copy wins, however late
-    /// and whoever sent it.
+    /// Event: pixels of `tile` came from `worker`. Tiles are deterministic: the first copy wins,
+    /// however late and whoever sent it. `None` when the job is over.
     pub(crate) fn on_pixels(
         &mut self,
         worker: WorkerId,
-        epoch: Epoch,
+        name: LeaseName,
         tile: TileId,
         hash: PixelHash,
         now: Instant,
-    ) -> Verdict {
-        self.on_progress(worker, epoch, now);
-        let (place, lease_count) = match self.tiles[tile.index()] {
-            Tile::Done(first) if first == hash => return Verdict::Duplicate,
-            Tile::Done(first) => return Verdict::Differs(first),
-            Tile::Open { place, leases } => (place, leases),
-        };
-        self.tiles[tile.index()] = Tile::Done(hash);
-        self.free.remove(&place);
-        let mut left = lease_count;
-        if let Some(lease) = self.held.get_mut(&epoch) {
-            lease.last_tile = now;
-            left -= u8::from(self.drop_from_lease(place, epoch));
-        }
-        if left > 0 {
-            // Rendered twice, or under a lease that was lost: seldom enough to look at them all.
-            let others: Vec<Epoch> = self.held.keys().copied().collect();
-            for other in others {
-                self.drop_from_lease(place, other);
+    ) -> Option<Arrival> {
+        let has_lease = self.on_progress(worker, name, now);
+        let tiles = self.jobs.get_mut(&name.job)?;
+        let arrival = tiles.on_pixels(tile, hash);
+        if let Arrival::First(place, holders) = arrival {
+            if tiles.free_count() == 0 {
+                self.with_free.remove(&name.job);
+            }
+            if has_lease {
+                self.on_tile(name.id, now);
+            }
+            for holder in holders.iter() {
+                self.drop_tile(holder, place);
             }
         }
-        Verdict::Stitch
+        Some(arrival)
     }
 
-    /// Takes a tile that is done out of a lease, which ends with its last tile.
-    fn drop_from_lease(&mut self, place: u32, epoch: Epoch) -> bool {
-        let Some(lease) = self.held.get_mut(&epoch) else { return false };
-        let was_in = lease.tiles.remove(&place);
-        if lease.tiles.is_empty() {
-            self.expiries.remove(&(lease.until, epoch));
-            self.held.remove(&epoch);
+    /// Event: the pixels of `tile` are in the picture. Answers with the number of such tiles;
+    /// `None` when the job is over.
+    pub(crate) fn on_stored(&mut self, job: JobId, tile: TileId) -> Option<u32> {
+        let tiles = self.jobs.get_mut(&job)?;
+        tiles.on_stored(tile);
+        Some(tiles.done_count())
+    }
+
+    /// Event: a tile came under a lease, which is not quiet therefore.
+    fn on_tile(&mut self, id: LeaseId, now: Instant) {
+        if let Some(lease) = self.held.get_mut(&id) {
+            if self.last_tiles.remove(&(lease.last_tile, id)) {
+                self.last_tiles.insert((now, id));
+            }
+            lease.last_tile = now;
         }
-        was_in
+    }
+
+    /// Takes a tile whose pixels came out of a lease, which ends with its last tile.
+    fn drop_tile(&mut self, id: LeaseId, place: Place) {
+        let Some(lease) = self.held.get_mut(&id) else { return };
+        lease.shared.remove(&place);
+        if lease.alone.remove(&place) && lease.alone.is_empty() {
+            self.last_tiles.remove(&(lease.last_tile, id));
+        }
+        if lease.alone.is_empty() && lease.shared.is_empty() {
+            self.remove(id);
+        }
     }
 
     /// Event: time passes. Leases that ran out are lost and their tiles free again.
-    pub(crate) fn on_tick(&mut self, now: Instant) -> Vec<Loss> {
+    pub(crate) fn on_time(&mut self, now: Instant) -> Vec<Loss> {
         let mut losses = Vec::new();
-        while let Some(&(until, epoch)) = self.expiries.first()
+        while let Some(&(until, id)) = self.expiries.first()
             && until <= now
         {
-            losses.extend(self.lose(epoch));
+            losses.extend(self.lose(id));
         }
         losses
     }
 
     /// Event: `worker` is gone and will not come back.
     pub(crate) fn on_worker_lost(&mut self, worker: WorkerId) -> Vec<Loss> {
-        let lost = self.held.iter().filter(|(_, lease)| lease.worker == worker);
-        let lost: Vec<Epoch> = lost.map(|(&epoch, _)| epoch).collect();
-        lost.into_iter().filter_map(|epoch| self.lose(epoch)).collect()
+        let of_worker = (worker, LeaseId(0))..=(worker, LeaseId(u64::MAX));
+        let lost: Vec<LeaseId> = self.by_worker.range(of_worker).map(|&(_, id)| id).collect();
+        lost.into_iter().filter_map(|id| self.lose(id)).collect()
     }
 
-    fn lose(&mut self, epoch: Epoch) -> Option<Loss> {
-        let lease = self.held.remove(&epoch)?;
-        self.expiries.remove(&(lease.until, epoch));
-        for &place in &lease.tiles {
-            let lease_count = self.lease_count_mut(place);
-            *lease_count -= 1;
-            if *lease_count == 0 {
-                self.free.insert(place);
+    fn lose(&mut self, id: LeaseId) -> Option<Loss> {
+        let Lease { job, worker, alone, shared, .. } = self.remove(id)?;
+        let tiles = self.jobs.get_mut(&job)?;
+        for &place in alone.iter().chain(&shared) {
+            let Some(other) = tiles.give_back(place, id) else { continue };
+            // The other lease now holds the tile alone.
+            if let Some(lease) = self.held.get_mut(&other) {
+                lease.shared.remove(&place);
+                lease.alone.insert(place);
+                self.last_tiles.insert((lease.last_tile, other));
             }
         }
-        let tiles = lease.tiles.iter().map(|&place| self.order[place as usize]).collect();
-        Some(Loss { worker: lease.worker, epoch, tiles })
+        if tiles.free_count() > 0 {
+            self.with_free.insert(job);
+        }
+        let places = alone.into_iter().chain(shared).collect();
+        Some(Loss { lease: LeaseName { job, id }, worker, tiles: tiles.at(&places) })
+    }
+
+    /// Takes a lease out of the table and every index.
+    fn remove(&mut self, id: LeaseId) -> Option<Lease> {
+        let lease = self.held.remove(&id)?;
+        self.expiries.remove(&(lease.until, id));
+        self.last_tiles.remove(&(lease.last_tile, id));
+        self.by_worker.remove(&(lease.worker, id));
+        self.by_job.remove(&(lease.job, id));
+        Some(lease)
+    }
+}
+
+#[cfg(test)]
+impl Leases {
+    /// Checks every invariant, at the price of a scan.
+    pub(crate) fn check(&self, is_member: impl Fn(WorkerId) -> bool) {
+        assert!(self.held.values().all(|lease| is_member(lease.worker)));
+        let mut held: BTreeMap<LeaseId, [BTreeSet<Place>; 2]> = BTreeMap::new();
+        for (job, tiles) in &self.jobs {
+            for (place, holders) in tiles.check() {
+                let is_shared = usize::from(holders.iter().count() == 2);
+                for holder in holders.iter() {
+                    assert_eq!(self.held[&holder].job, *job);
+                    held.entry(holder).or_default()[is_shared].insert(place);
+                }
+            }
+            assert_eq!(self.with_free.contains(job), tiles.free_count() > 0);
+        }
+        assert!(self.with_free.iter().all(|job| self.jobs.contains_key(job)));
+        assert_eq!(held.len(), self.held.len(), "a lease holds at least one tile");
+        for (id, lease) in &self.held {
+            assert_eq!([&lease.alone, &lease.shared], held[id].each_ref());
+        }
+        let leases = || self.held.iter();
+        assert!(self.expiries == leases().map(|(&id, lease)| (lease.until, id)).collect());
+        assert!(self.by_worker == leases().map(|(&id, lease)| (lease.worker, id)).collect());
+        assert!(self.by_job == leases().map(|(&id, lease)| (lease.job, id)).collect());
+        let alone = leases().filter(|(_, lease)| !lease.alone.is_empty());
+        assert!(self.last_tiles == alone.map(|(&id, lease)| (lease.last_tile, id)).collect());
+    }
+
+    fn is_empty(&self) -> bool {
+        self.held.is_empty()
+    }
+
+    fn has_free(&self) -> bool {
+        !self.with_free.is_empty()
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use rtfarm_core::tile::Size;
+    use rtfarm_core::tile::{Size, TileGrid};
 
     use super::*;
 
     const TERM: Duration = Duration::from_secs(4);
+    const JOB: JobId = JobId(1);
     const A: WorkerId = WorkerId(1);
     const B: WorkerId = WorkerId(2);
 
-    /// A row of tiles, of which the first worker has leased all under epoch 1.
-    fn all_leased(tile_count: u64) -> (Leases, Vec<TileId>, Instant) {
-        let grid = TileGrid::new(Size::new(tile_count * 16, 16).unwrap(), 16).unwrap();
-        let mut leases = Leases::new(grid, TERM);
+    fn lease(id: u64) -> LeaseName {
+        LeaseName { job: JOB, id: LeaseId(id) }
+    }
+
+    /// A job of `columns` x `rows` tiles.
+    fn job(columns: u64, rows: u64) -> (Leases, Instant) {
+        let grid = TileGrid::new(Size::new(columns * 16, rows * 16).unwrap(), 16).unwrap();
+        let mut leases = Leases::new(TERM);
+        leases.on_submit(JOB, Tiles::new(grid));
         #[expect(clippy::disallowed_methods, reason = "any instant will do")]
         let start = Instant::now();
-        let run = leases.on_idle(A, (8, 1), 64, Epoch(1), start).unwrap();
-        assert_eq!(run.tiles.len() as u64, tile_count);
+        (leases, start)
+    }
+
+    /// A job of a row of tiles, of which the first worker has leased all under lease 1.
+    fn all_leased(tile_count: u64) -> (Leases, Vec<TileId>, Instant) {
+        let (mut leases, start) = job(tile_count, 1);
+        let run = leases.on_idle(A, (8, 1), 64, start).unwrap();
+        assert_eq!((run.lease, run.tiles.len() as u64), (lease(1), tile_count));
+        assert!(!leases.has_free());
         (leases, run.tiles, start)
+    }
+
+    /// Pixels of a tile that is open, and whose pixels are stored at once.
+    fn deliver(leases: &mut Leases, worker: WorkerId, id: u64, tile: TileId, now: Instant) {
+        let arrival = leases.on_pixels(worker, lease(id), tile, [7; 32], now);
+        assert!(matches!(arrival, Some(Arrival::First(..))), "{arrival:?}");
+        leases.on_stored(JOB, tile).unwrap();
+        leases.check(|_| true);
+    }
+
+    /// From when on `worker` may render a tile of the quietest lease of others again.
+    fn quiet_for(leases: &Leases, worker: WorkerId) -> Option<(Instant, LeaseId)> {
+        let mut others = leases.quietest().filter(|&(_, holder, _)| holder != worker);
+        others.next().map(|(from, _, id)| (from, id))
     }
 
     #[test]
     fn a_lease_without_progress_is_lost_and_its_tiles_go_to_others() {
         let (mut leases, tiles, start) = all_leased(5);
-        leases.on_pixels(A, Epoch(1), tiles[0], [0; 32], start);
-        assert_eq!(leases.on_tick(start + TERM / 2), []);
-        assert!(leases.on_progress(A, Epoch(1), start + TERM / 2));
-        assert_eq!(leases.on_tick(start + TERM), [], "progress renews it");
+        deliver(&mut leases, A, 1, tiles[0], start);
+        assert_eq!(leases.on_time(start + TERM / 2), []);
+        assert!(leases.on_progress(A, lease(1), start + TERM / 2));
+        assert_eq!(leases.on_time(start + TERM), [], "progress renews it");
+        assert_eq!(leases.next_expiry(), Some(start + TERM * 3 / 2));
 
-        let lost = leases.on_tick(start + TERM * 3 / 2);
+        let lost = leases.on_time(start + TERM * 3 / 2);
         let rest = tiles[1..].to_vec();
-        assert_eq!(lost, [Loss { worker: A, epoch: Epoch(1), tiles: rest.clone() }]);
-        assert!(!leases.on_progress(A, Epoch(1), start + TERM * 2));
-        let run = leases.on_idle(B, (8, 1), 64, Epoch(2), start + TERM * 2).unwrap();
+        assert_eq!(lost, [Loss { lease: lease(1), worker: A, tiles: rest.clone() }]);
+        leases.check(|_| true);
+        assert!(!leases.on_progress(A, lease(1), start + TERM * 2));
+        let run = leases.on_idle(B, (8, 1), 64, start + TERM * 2).unwrap();
         assert_eq!(run.tiles, rest);
+    }
+
+    #[test]
+    fn nobody_renews_the_lease_of_another_worker_or_job() {
+        let (mut leases, _, start) = all_leased(2);
+        assert!(!leases.on_progress(B, lease(1), start));
+        assert!(!leases.on_progress(A, LeaseName { job: JobId(2), ..lease(1) }, start));
+        assert_eq!(leases.on_time(start + TERM).len(), 1);
     }
 
     #[test]
     fn late_pixels_of_a_lost_lease_are_the_first_copy() {
         let (mut leases, tiles, start) = all_leased(2);
         leases.on_worker_lost(A);
-        assert_eq!(leases.on_pixels(A, Epoch(1), tiles[0], [7; 32], start), Verdict::Stitch);
-        let run = leases.on_idle(B, (8, 1), 64, Epoch(2), start).unwrap();
+        deliver(&mut leases, A, 1, tiles[0], start);
+        let run = leases.on_idle(B, (8, 1), 64, start).unwrap();
         assert_eq!(run.tiles, tiles[1..]);
     }
 
     #[test]
-    fn a_second_copy_is_compared_with_the_first() {
+    fn a_second_copy_meets_the_first_ones_hash() {
         let (mut leases, tiles, start) = all_leased(1);
-        let mut deliver = |hash| leases.on_pixels(A, Epoch(1), tiles[0], [hash; 32], start);
-        assert_eq!(deliver(1), Verdict::Stitch);
-        assert_eq!(deliver(1), Verdict::Duplicate);
-        assert_eq!(deliver(2), Verdict::Differs([1; 32]));
+        let copy =
+            |leases: &mut Leases, hash| leases.on_pixels(A, lease(1), tiles[0], [hash; 32], start);
+        assert!(matches!(copy(&mut leases, 1), Some(Arrival::First(..))));
+        assert_eq!(copy(&mut leases, 2), Some(Arrival::WhileStoring([1; 32])));
+        assert_eq!(leases.on_stored(JOB, tiles[0]), Some(1));
+        assert_eq!(copy(&mut leases, 2), Some(Arrival::AfterDone([1; 32])));
     }
 
     #[test]
-    fn a_silent_lease_is_rendered_twice_from_its_end_and_once_only() {
+    fn a_quiet_lease_is_rendered_twice_from_its_end_and_once_only() {
         let (mut leases, tiles, start) = all_leased(2);
-        assert_eq!(leases.on_idle(B, (1, 1), 1, Epoch(2), start), None);
-        let later = start + SLOW;
-        assert_eq!(leases.on_idle_at_the_end(B, Epoch(2), start), Again::Wait(Some(later)));
-        assert_eq!(leases.on_idle_at_the_end(A, Epoch(2), later), Again::Wait(None));
-        for (epoch, &tile) in (2..).zip(tiles.iter().rev()) {
-            let run = Run { epoch: Epoch(epoch), tiles: vec![tile] };
-            assert_eq!(leases.on_idle_at_the_end(B, run.epoch, later), Again::Render(run));
+        let later = start + QUIET;
+        assert_eq!(quiet_for(&leases, B), Some((later, LeaseId(1))));
+        assert_eq!(quiet_for(&leases, A), None, "it is its own");
+        for (id, &tile) in (2..).zip(tiles.iter().rev()) {
+            let run = Run { lease: lease(id), tiles: vec![tile] };
+            assert_eq!(leases.on_idle_at_the_end(B, LeaseId(1), later), Some(run));
+            leases.check(|_| true);
         }
-        assert_eq!(leases.on_idle_at_the_end(B, Epoch(9), later), Again::Wait(None));
+        assert_eq!(leases.on_idle_at_the_end(B, LeaseId(1), later), None);
+        assert_eq!(quiet_for(&leases, B), None);
 
-        for (epoch, &tile) in (2..).zip(tiles.iter().rev()) {
-            leases.on_pixels(B, Epoch(epoch), tile, [0; 32], later);
+        for (id, &tile) in (2..).zip(tiles.iter().rev()) {
+            deliver(&mut leases, B, id, tile, later);
         }
-        assert!(leases.held.is_empty() && leases.expiries.is_empty(), "nothing is left open");
+        assert!(leases.is_empty(), "nothing is left open");
+    }
+
+    #[test]
+    fn a_tile_whose_second_rendering_is_lost_may_have_another() {
+        let (mut leases, tiles, start) = all_leased(1);
+        leases.on_idle_at_the_end(B, LeaseId(1), start).unwrap();
+        assert_eq!(leases.on_worker_lost(B).len(), 1);
+        leases.check(|_| true);
+        assert!(!leases.has_free(), "its first holder still has it");
+        let run = leases.on_idle_at_the_end(B, LeaseId(1), start).unwrap();
+        assert_eq!(leases.on_worker_lost(A).len(), 1);
+        leases.check(|_| true);
+        deliver(&mut leases, B, run.lease.id.0, tiles[0], start);
+        assert!(leases.is_empty());
+    }
+
+    #[test]
+    fn the_leases_of_an_ended_job_are_lost() {
+        let (mut leases, tiles, start) = all_leased(4);
+        leases.on_end(JOB);
+        leases.check(|_| true);
+        assert!(leases.is_empty() && !leases.has_free());
+        assert!(!leases.on_progress(A, lease(1), start));
+        assert_eq!(leases.on_pixels(A, lease(1), tiles[0], [0; 32], start), None);
+        assert_eq!(leases.on_stored(JOB, tiles[0]), None);
     }
 
     #[test]
     fn runs_shorten_towards_the_end() {
-        let grid = TileGrid::new(Size::new(1600, 160).unwrap(), 16).unwrap();
-        let mut leases = Leases::new(grid, TERM);
-        let (_, _, start) = all_leased(1);
-        let lengths: Vec<usize> = (0..)
-            .map_while(|epoch| leases.on_idle(A, (1, 4), 1000, Epoch(epoch), start))
+        let (mut leases, start) = job(100, 10);
+        let lengths: Vec<usize> = std::iter::from_fn(|| leases.on_idle(A, (1, 4), 1000, start))
             .map(|run| run.tiles.len())
             .collect();
         assert!(lengths.is_sorted_by(|a, b| a >= b), "{lengths:?}");

@@ -1,19 +1,28 @@
 //! The coordinator of a farm: it takes orders, leases tiles to workers and stitches what they
 //! bring into pictures.
 //!
-//! `lease` and `jobs` decide and never wait; `service` and `run` are the shell around them.
+//! `farm` and what it is made of decide: time is an argument there, and nothing waits. `shell` runs
+//! that machine: it hands events to it and does what it answers, with the files of `store` and what
+//! it keeps of each `job`. `service` translates between gRPC and the shell, and `run` serves. Each
+//! knows only what stands before it:
+//!
+//! ```text
+//! tiles <- lease, members, waiting <- farm, store, job <- shell <- service <- run
+//! ```
 
+mod farm;
 mod job;
-mod jobs;
 mod lease;
-mod log;
-mod order;
+mod members;
 mod run;
 mod service;
+mod shell;
+#[cfg(test)]
+mod simulation;
 mod store;
+mod tiles;
+mod waiting;
 
-pub use job::{End, Job, Progress};
-pub use log::{TileCost, log_tile};
-pub use order::{MOST_TILES, Order, Placed, Refusal, Wish};
-pub use run::{Config, Coordinator, Listener, SubmitError};
-pub use store::{folder_of, new_picture};
+pub use job::Job;
+pub use run::{Coordinator, Listener};
+pub use shell::{Config, SubmitError};

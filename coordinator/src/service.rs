@@ -1,4 +1,5 @@
-//! The gRPC services: parse, decide, answer. A `Status` is chosen here and nowhere else.
+//! The gRPC services: requests to events, answers to responses. A `Status` is chosen here and
+//! nowhere else.
 
 use std::{
     collections::HashMap,
@@ -9,11 +10,12 @@ use std::{
 };
 
 use rtfarm_core::{
-    picture::{PutError, check_pixels},
     read::{Style, draw_diagnostics},
     render::Tally,
-    tile::{Size, TileId},
+    tile::Size,
 };
+use rtfarm_job::{Outcome, Placed, Progress, Refusal, RenderRequest};
+use rtfarm_picture::check_pixels;
 use rtfarm_proto::{
     CHUNK_BYTES, JobId, LONGEST_WAIT, LeaseName, MESSAGE_BYTES, PROTOCOL, WireError, WorkerId,
     pixels_from_bytes, scene_hash, transfer,
@@ -21,7 +23,7 @@ use rtfarm_proto::{
         self, event, farm_server, jobs_server, lease_response, submit_request, submit_response,
     },
 };
-use tokio::{sync::mpsc, time::Instant};
+use tokio::sync::{mpsc, oneshot};
 use tokio_stream::{Stream, wrappers::ReceiverStream};
 use tonic::{
     Request, Response, Status, Streaming,
@@ -32,11 +34,12 @@ use tonic::{
 };
 
 use crate::{
-    job::{End, Job, Progress},
-    jobs::{Next, NoMember},
-    lease::{PixelHash, Verdict},
-    order::{Placed, Refusal, Wish},
-    run::{Coordinator, Shared},
+    farm::{Delivery, Next, Verdict},
+    job::Job,
+    lease::Run,
+    members::{NoMember, Process},
+    shell::Shell,
+    tiles::PixelHash,
 };
 
 /// The most bytes that a scene and its files may have.
@@ -49,12 +52,12 @@ type Chunks = Pin<Box<dyn Stream<Item = Result<wire::Chunk, Status>> + Send>>;
 type Events = Pin<Box<dyn Stream<Item = Result<wire::Event, Status>> + Send>>;
 
 /// Both services over one coordinator.
-pub(crate) fn router(shared: &Arc<Shared>) -> Router {
+pub(crate) fn router(shell: &Arc<Shell>) -> Router {
     const WINDOW_BYTES: u32 = 1 << 22;
-    let farm = farm_server::FarmServer::new(FarmService { shared: Arc::clone(shared) })
+    let farm = farm_server::FarmServer::new(FarmService { shell: Arc::clone(shell) })
         .max_decoding_message_size(MESSAGE_BYTES)
         .max_encoding_message_size(MESSAGE_BYTES);
-    let jobs = jobs_server::JobsServer::new(JobsService { shared: Arc::clone(shared) })
+    let jobs = jobs_server::JobsServer::new(JobsService { shell: Arc::clone(shell) })
         .max_decoding_message_size(MESSAGE_BYTES)
         .max_encoding_message_size(MESSAGE_BYTES);
     Server::builder()
@@ -67,7 +70,7 @@ pub(crate) fn router(shared: &Arc<Shared>) -> Router {
 }
 
 struct FarmService {
-    shared: Arc<Shared>,
+    shell: Arc<Shell>,
 }
 
 #[tonic::async_trait]
@@ -76,15 +79,12 @@ impl farm_server::Farm for FarmService {
         &self,
         request: Request<wire::JoinRequest>,
     ) -> Result<Response<wire::JoinResponse>, Status> {
-        let join = request.into_inner();
-        check_version("worker", &join.version, join.protocol, &self.shared)?;
-        let worker = self.shared.jobs().on_join(join.nonce, join.threads as usize, now());
-        let is_new = self.shared.processes().insert(worker, join.process).is_none();
-        if is_new {
-            let wire::JoinRequest { host, process, threads, isa, .. } = join;
-            tracing::info!(worker = worker.0, host, process, threads, isa, "worker joined");
-        }
-        let term_ms = u32::try_from(self.shared.config.term.as_millis()).unwrap_or(u32::MAX);
+        let wire::JoinRequest { version, protocol, nonce, threads, isa, host, process } =
+            request.into_inner();
+        check_version("worker", &version, protocol, &self.shell)?;
+        let threads = threads as usize;
+        let worker = self.shell.join(Process { nonce, number: process, threads, host, isa });
+        let term_ms = u32::try_from(self.shell.config.term.as_millis()).unwrap_or(u32::MAX);
         Ok(Response::new(wire::JoinResponse { worker: worker.0, term_ms }))
     }
 
@@ -95,7 +95,18 @@ impl farm_server::Farm for FarmService {
         let is_local = request.extensions().get::<UdsConnectInfo>().is_some();
         let wire::LeaseRequest { worker, max_tiles, wait_ms } = request.into_inner();
         let wait = Duration::from_millis(wait_ms.into()).min(LONGEST_WAIT);
-        let next = self.shared.next(WorkerId(worker), max_tiles as usize, wait, is_local).await?;
+        let next = self.shell.ask(WorkerId(worker), max_tiles as usize, wait).await;
+        let next = match next.map_err(no_member)? {
+            Next::Render(run) => {
+                tracing::debug!(worker, ?run, "leased");
+                // A job that was cancelled a moment ago is nothing to do.
+                let job = self.shell.job(run.lease.job);
+                job.map(|job| lease_response::Next::Run(to_run(&run, &job, is_local)))
+            }
+            Next::Nothing => None,
+            Next::GoHome => Some(lease_response::Next::ShutDown(wire::ShutDown {})),
+        };
+        let next = next.unwrap_or(lease_response::Next::Nothing(wire::Nothing {}));
         Ok(Response::new(wire::LeaseResponse { next: Some(next) }))
     }
 
@@ -105,8 +116,8 @@ impl farm_server::Farm for FarmService {
     ) -> Result<Response<wire::RenewResponse>, Status> {
         let wire::RenewRequest { worker, leases } = request.into_inner();
         let leases: Vec<LeaseName> = leases.into_iter().map(LeaseName::from).collect();
-        let lost = self.shared.jobs().on_progress(WorkerId(worker), &leases, now());
-        let lost = lost.map_err(no_member)?.into_iter().map(Into::into).collect();
+        let lost = self.shell.renew(WorkerId(worker), &leases).map_err(no_member)?;
+        let lost = lost.into_iter().map(Into::into).collect();
         Ok(Response::new(wire::RenewResponse { lost }))
     }
 
@@ -114,9 +125,19 @@ impl farm_server::Farm for FarmService {
         &self,
         request: Request<wire::DeliverRequest>,
     ) -> Result<Response<wire::DeliverResponse>, Status> {
-        let shared = Arc::clone(&self.shared);
+        let shell = Arc::clone(&self.shell);
         let delivery = request.into_inner();
-        let verdict = blocking(move || shared.take(&delivery)).await?;
+        let (worker, tile) = (delivery.worker, delivery.tile);
+        let verdict = match blocking(move || take(&shell, &delivery)).await? {
+            Some(verdict) => verdict.await.expect("every delivery is answered"),
+            None => Verdict::Rejected,
+        };
+        tracing::debug!(worker, tile, ?verdict, "answered");
+        let verdict = match verdict {
+            Verdict::Accepted => wire::Verdict::Accepted,
+            Verdict::Duplicate => wire::Verdict::Duplicate,
+            Verdict::Rejected => wire::Verdict::Rejected,
+        };
         Ok(Response::new(wire::DeliverResponse { verdict: verdict.into() }))
     }
 
@@ -125,7 +146,7 @@ impl farm_server::Farm for FarmService {
         request: Request<wire::LeaveRequest>,
     ) -> Result<Response<wire::LeaveResponse>, Status> {
         let wire::LeaveRequest { worker, reason } = request.into_inner();
-        self.shared.lose_worker(WorkerId(worker), &reason);
+        self.shell.leave(WorkerId(worker), &reason);
         Ok(Response::new(wire::LeaveResponse {}))
     }
 
@@ -136,147 +157,40 @@ impl farm_server::Farm for FarmService {
         request: Request<wire::FetchRequest>,
     ) -> Result<Response<Chunks>, Status> {
         let hash = scene_hash(&request.into_inner().scene_hash).map_err(invalid)?;
-        let mut jobs = self.shared.kept_jobs().into_iter();
-        let job = jobs
-            .find(|job| job.scene.hash() == hash)
-            .ok_or_else(|| Status::not_found("no job has this scene now"))?;
+        let job = self.shell.job_with_scene(hash);
+        let job = job.ok_or_else(|| Status::not_found("no job has this scene now"))?;
         let file = std::fs::File::open(job.scene.path()).map_err(|error| broken(&error))?;
         Ok(Response::new(stream_file(file, job)))
     }
 }
 
-impl Shared {
-    /// Waits for work for a worker.
-    async fn next(
-        &self,
-        worker: WorkerId,
-        most: usize,
-        wait: Duration,
-        is_local: bool,
-    ) -> Result<lease_response::Next, Status> {
-        let deadline = Instant::now() + wait;
-        let mut changed = self.changed.subscribe();
-        loop {
-            if self.closing.is_cancelled() {
-                self.processes().remove(&worker);
-                return Ok(lease_response::Next::ShutDown(wire::ShutDown {}));
-            }
-            changed.borrow_and_update();
-            let next = self.jobs().on_idle(worker, most, now()).map_err(no_member)?;
-            let ask_again = match next {
-                Next::Render(job, run) => match self.job(job) {
-                    Some(job) => {
-                        tracing::debug!(worker = worker.0, ?run, "leased");
-                        return Ok(lease_response::Next::Run(wire::Run {
-                            lease: Some(LeaseName { job: job.id, epoch: run.epoch }.into()),
-                            tiles: run.tiles.iter().map(|tile| tile.number()).collect(),
-                            job: Some(describe(&job, is_local)),
-                        }));
-                    }
-                    // It was cancelled a moment ago.
-                    None => Some(Instant::now()),
-                },
-                Next::Wait(until) => until.map(Instant::from_std),
-            };
-            if Instant::now() >= deadline {
-                return Ok(lease_response::Next::Nothing(wire::Nothing {}));
-            }
-            let wake = ask_again.map_or(deadline, |until| until.min(deadline));
-            tokio::select! {
-                _ = changed.changed() => {}
-                () = self.closing.cancelled() => {}
-                () = tokio::time::sleep_until(wake) => {}
-            }
-        }
+/// Reads a delivery and hands it on. `None` when there is no such tile, or the pixels are none of
+/// it. This hashes and writes: never call it on the async runtime.
+fn take(
+    shell: &Shell,
+    request: &wire::DeliverRequest,
+) -> Result<Option<oneshot::Receiver<Verdict>>, Status> {
+    let lease = request.lease.ok_or_else(|| invalid(WireError::Missing("lease")))?;
+    let (worker, lease) = (WorkerId(request.worker), LeaseName::from(lease));
+    let Some((tile, area)) = shell.tile(lease.job, request.tile) else { return Ok(None) };
+    let hash: PixelHash = *blake3::hash(&request.pixels).as_bytes();
+    let pixels = pixels_from_bytes(&request.pixels).map_err(invalid)?;
+    let tally = request.tally.ok_or_else(|| invalid(WireError::Missing("tally")))?;
+    let tally = Tally::try_from(tally).map_err(invalid)?;
+    if request.hash != hash[..] {
+        tracing::error!(worker = worker.0, tile = tile.number(), "pixels were damaged");
+        return Err(Status::data_loss("the pixels do not have the hash they came with"));
     }
-
-    /// Stitches a tile, if it is the first copy.
-    fn take(&self, delivery: &wire::DeliverRequest) -> Result<wire::Verdict, Status> {
-        let lease = delivery.lease.ok_or_else(|| invalid(WireError::Missing("lease")))?;
-        let (worker, lease) = (WorkerId(delivery.worker), LeaseName::from(lease));
-        let tile = self.jobs().tile(lease.job, delivery.tile);
-        let (Some(tile), Some(job)) = (tile, self.job(lease.job)) else {
-            return Ok(wire::Verdict::Rejected);
-        };
-        let area = job.grid.area(tile);
-        let hash: PixelHash = *blake3::hash(&delivery.pixels).as_bytes();
-        let pixels = pixels_from_bytes(&delivery.pixels).map_err(invalid)?;
-        let tally = delivery.tally.ok_or_else(|| invalid(WireError::Missing("tally")))?;
-        let tally = Tally::try_from(tally).map_err(invalid)?;
-        if delivery.hash != hash[..] {
-            tracing::error!(worker = worker.0, tile = tile.number(), "pixels were damaged");
-            return Err(Status::data_loss("the pixels do not have the hash they came with"));
-        }
-        if let Err(error) = check_pixels(area, &pixels) {
-            let reason = format!("worker {worker} rendered tile {}: {error}", tile.number());
-            self.end(job.id, End::Failed(reason));
-            return Ok(wire::Verdict::Rejected);
-        }
-
-        let verdict = self.jobs().on_pixels(worker, lease, tile, hash, now());
-        match verdict {
-            Some(Verdict::Stitch) => {
-                match job.picture.put(area, &pixels) {
-                    Ok(()) => self.on_stitched(&job, worker, tile, (tally, delivery.seconds)),
-                    Err(error) => self.fail_picture(&job, &error),
-                }
-                Ok(wire::Verdict::Accepted)
-            }
-            Some(Verdict::Duplicate) => {
-                tracing::debug!(worker = worker.0, tile = tile.number(), "second copy");
-                Ok(wire::Verdict::Duplicate)
-            }
-            Some(Verdict::Differs(first)) => {
-                job.progress.send_modify(|progress| progress.differing_tiles += 1);
-                tracing::error!(
-                    worker = worker.0,
-                    tile = tile.number(),
-                    first = %blake3::Hash::from_bytes(first),
-                    second = %blake3::Hash::from_bytes(hash),
-                    "two copies of a tile differ; one of their workers is broken"
-                );
-                Ok(wire::Verdict::Duplicate)
-            }
-            None => Ok(wire::Verdict::Rejected),
-        }
+    if let Err(error) = check_pixels(area, &pixels) {
+        shell.report_senseless_pixels(worker, lease.job, tile, &error.to_string());
+        return Ok(None);
     }
-
-    fn fail_picture(&self, job: &Job, error: &PutError) {
-        self.end(job.id, End::Failed(error.to_string()));
-    }
-
-    fn on_stitched(
-        &self,
-        job: &Job,
-        worker: WorkerId,
-        tile: TileId,
-        (tally, seconds): (Tally, f64),
-    ) {
-        let elapsed = job.started.elapsed();
-        let mut now_done = Progress::default();
-        job.progress.send_modify(|progress| {
-            progress.tiles_done += 1;
-            progress.tally.add(&tally);
-            progress.workers.insert(worker);
-            now_done.clone_from(progress);
-        });
-        let (done, count) = (now_done.tiles_done, now_done.tile_count);
-        crate::log_tile(
-            done,
-            count,
-            tile,
-            worker,
-            &crate::TileCost { seconds, rays: tally.rays },
-            elapsed,
-        );
-        if done == count {
-            self.end(job.id, End::Finished(elapsed));
-        }
-    }
+    let delivery = Delivery { worker, lease, tile, hash, seconds: request.seconds, tally };
+    Ok(Some(shell.deliver(delivery, pixels)))
 }
 
 struct JobsService {
-    shared: Arc<Shared>,
+    shell: Arc<Shell>,
 }
 
 #[tonic::async_trait]
@@ -286,9 +200,9 @@ impl jobs_server::Jobs for JobsService {
         request: Request<Streaming<wire::SubmitRequest>>,
     ) -> Result<Response<wire::SubmitResponse>, Status> {
         let Bundle { order, text, files } = receive(request.into_inner()).await?;
-        check_version("client", &order.version, order.protocol, &self.shared)?;
-        let wish = to_wish(order).map_err(invalid)?;
-        let coordinator = Coordinator { shared: Arc::clone(&self.shared) };
+        check_version("client", &order.version, order.protocol, &self.shell)?;
+        let wanted = to_request(order).map_err(invalid)?;
+        let shell = Arc::clone(&self.shell);
         let (outcome, report) = blocking(move || {
             let resolve = |path: &str| {
                 files.get(path).cloned().ok_or_else(|| {
@@ -296,12 +210,12 @@ impl jobs_server::Jobs for JobsService {
                     io::Error::new(io::ErrorKind::NotFound, reason)
                 })
             };
-            let name = wish.name.clone();
-            let Placed { order, diagnostics, omitted } = wish.place(&text, &resolve);
+            let name = wanted.name.clone();
+            let Placed { order, diagnostics, omitted } = wanted.place(&text, &resolve);
             let mut report = draw_diagnostics(&name, &text, &diagnostics, Style::Plain);
             report.extend(omitted.summary());
             let job = order.and_then(|order| {
-                coordinator.submit(order).map_err(|error| Refusal::Other(error.to_string()))
+                shell.submit(order).map_err(|error| Refusal::Other(error.to_string()))
             });
             let outcome = match job {
                 Ok(job) => submit_response::Outcome::Accepted(wire::Accepted {
@@ -351,10 +265,10 @@ impl jobs_server::Jobs for JobsService {
         request: Request<wire::ImageRequest>,
     ) -> Result<Response<Chunks>, Status> {
         let job = self.known_job(request.into_inner().job)?;
-        if !matches!(job.progress.borrow().end, Some(End::Finished(_))) {
+        if !matches!(job.progress.borrow().outcome, Some(Outcome::Finished(_))) {
             return Err(Status::failed_precondition("the job has not finished"));
         }
-        let folder = self.shared.config.picture_folder.clone();
+        let folder = self.shell.config.picture_folder.clone();
         let encoded = blocking({
             let job = Arc::clone(&job);
             move || {
@@ -376,15 +290,14 @@ impl jobs_server::Jobs for JobsService {
         &self,
         request: Request<wire::CancelRequest>,
     ) -> Result<Response<wire::CancelResponse>, Status> {
-        let coordinator = Coordinator { shared: Arc::clone(&self.shared) };
-        coordinator.cancel(JobId(request.into_inner().job));
+        self.shell.cancel(JobId(request.into_inner().job));
         Ok(Response::new(wire::CancelResponse {}))
     }
 }
 
 impl JobsService {
     fn known_job(&self, job: u64) -> Result<Arc<Job>, Status> {
-        let job = self.shared.job(JobId(job));
+        let job = self.shell.job(JobId(job));
         job.ok_or_else(|| Status::not_found("there is no such job"))
     }
 }
@@ -420,14 +333,14 @@ async fn receive(mut parts: Streaming<wire::SubmitRequest>) -> Result<Bundle, St
     Ok(Bundle { order, text, files })
 }
 
-fn to_wish(order: wire::Order) -> Result<Wish, WireError> {
+fn to_request(order: wire::Order) -> Result<RenderRequest, WireError> {
     let format = order.format().try_into()?;
     let size = order.frame.map(Size::try_from).transpose()?;
     let transfer = transfer(order.transfer)?;
     let quality = order.quality.ok_or(WireError::Missing("quality"))?.try_into()?;
     let wire::Order { name, strict, tile_side, .. } = order;
     let tile_side = (tile_side > 0).then_some(tile_side.into());
-    Ok(Wish { name, strict, size, quality, tile_side, transfer, format })
+    Ok(RenderRequest { name, strict, size, quality, tile_side, transfer, format })
 }
 
 fn to_event(progress: &Progress) -> wire::Event {
@@ -435,25 +348,31 @@ fn to_event(progress: &Progress) -> wire::Event {
         tiles_done: progress.tiles_done,
         tile_count: progress.tile_count,
         tally: Some(progress.tally.into()),
-        workers: progress.workers.len() as u32,
+        workers: progress.worker_count,
         differing_tiles: progress.differing_tiles,
-        end: progress.end.as_ref().map(|end| match end {
-            End::Finished(time) => {
+        end: progress.outcome.as_ref().map(|outcome| match outcome {
+            Outcome::Finished(time) => {
                 event::End::Finished(wire::Finished { seconds: time.as_secs_f64() })
             }
-            End::Failed(reason) => event::End::Failed(reason.clone()),
+            Outcome::Failed(reason) => event::End::Failed(reason.clone()),
         }),
     }
 }
 
-fn describe(job: &Job, is_local: bool) -> wire::Job {
+/// Tells a worker all about its tiles; one on this machine also where the scene is.
+fn to_run(run: &Run, job: &Job, is_local: bool) -> wire::Run {
     let path = job.scene.path().to_str().filter(|_| is_local);
-    wire::Job {
+    let description = wire::Job {
         scene_hash: job.scene.hash().0.to_vec().into(),
         scene_bytes: job.scene.byte_count(),
         scene_path: path.unwrap_or_default().to_owned(),
         settings: Some(job.settings.into()),
         tile_side: job.grid.side(),
+    };
+    wire::Run {
+        lease: Some(run.lease.into()),
+        tiles: run.tiles.iter().map(|tile| tile.number()).collect(),
+        job: Some(description),
     }
 }
 
@@ -478,8 +397,8 @@ fn stream_file(mut file: std::fs::File, job: Arc<Job>) -> Chunks {
     Box::pin(ReceiverStream::new(receive))
 }
 
-fn check_version(who: &str, version: &str, protocol: u32, shared: &Shared) -> Result<(), Status> {
-    let ours = &shared.config.version;
+fn check_version(who: &str, version: &str, protocol: u32, shell: &Shell) -> Result<(), Status> {
+    let ours = &shell.config.version;
     if version == ours && protocol == PROTOCOL {
         return Ok(());
     }
@@ -490,16 +409,11 @@ fn check_version(who: &str, version: &str, protocol: u32, shared: &Shared) -> Re
     )))
 }
 
-fn now() -> std::time::Instant {
-    Instant::now().into_std()
-}
-
 #[expect(clippy::needless_pass_by_value, reason = "`map_err` hands it over")]
 fn invalid(error: WireError) -> Status {
     Status::invalid_argument(error.to_string())
 }
 
-#[expect(clippy::needless_pass_by_value, reason = "`map_err` hands it over")]
 fn no_member(error: NoMember) -> Status {
     Status::not_found(error.to_string())
 }

@@ -1,22 +1,13 @@
-//! Files of the coordinator: prepared scenes in its private folder, pictures without a name.
+//! Files of the coordinator: prepared scenes in its private folder.
 
 use std::{
-    fs::{self, File},
+    fs,
     io::{self, Write},
     os::unix::fs::PermissionsExt,
-    path::{Path, PathBuf},
+    path::Path,
 };
 
-use rtfarm_core::{
-    picture::{Picture, PictureFormat},
-    prepared::{PreparedBytes, SceneHash},
-    tile::Size,
-    transfer::Transfer,
-};
-use rustix::{
-    fs::{FallocateFlags, fallocate},
-    io::Errno,
-};
+use rtfarm_core::prepared::{PreparedBytes, SceneHash};
 use tempfile::{NamedTempFile, TempPath};
 
 /// A prepared scene on disk, written once. The file goes when this does.
@@ -48,33 +39,5 @@ impl SceneFile {
 
     pub(crate) fn byte_count(&self) -> u64 {
         self.byte_count
-    }
-}
-
-/// Makes a black picture in a file of `folder` that has no name, so that nothing stays behind
-/// however the process ends. Its bytes are reserved: a full disk is an error now, not later.
-pub fn new_picture(
-    folder: &Path,
-    size: Size,
-    format: PictureFormat,
-    transfer: Transfer,
-) -> io::Result<Picture> {
-    let file: File = tempfile::tempfile_in(folder)?;
-    let byte_count = Picture::byte_count(size, format);
-    loop {
-        match fallocate(&file, FallocateFlags::empty(), 0, byte_count) {
-            Ok(()) | Err(Errno::OPNOTSUPP) => break,
-            Err(Errno::INTR) => {}
-            Err(error) => return Err(error.into()),
-        }
-    }
-    Picture::new(file, size, format, transfer)
-}
-
-/// The folder in which a file of that path stands.
-pub fn folder_of(path: &Path) -> PathBuf {
-    match path.parent() {
-        Some(folder) if !folder.as_os_str().is_empty() => folder.to_owned(),
-        _ => PathBuf::from("."),
     }
 }

@@ -53,7 +53,9 @@ impl Farm {
             protocol: PROTOCOL,
             name: "test".to_owned(),
             frame: Some(wire::Frame { width: 16, height: 8 }),
-            quality: Some(Quality { sampling: Sampling::Fixed(1), ..Quality::default() }.into()),
+            quality: Some(
+                Quality { sampling: Sampling::fixed(1).unwrap(), ..Quality::default() }.into(),
+            ),
             tile_side: 8,
             format: wire::Format::Png8.into(),
             transfer: wire::Transfer::None.into(),

@@ -22,11 +22,11 @@ use std::{
 
 use rtfarm_core::{
     isa::Isa,
-    left_out::{self, BUILT_WITHOUT},
     prepare::prepare,
     prepared::{PreparedBytes, PreparedScene},
     read::read_scene,
-    render::{Quality, Sampling, Settings, render_tile},
+    render::{Quality, Sampling, render_tile},
+    testing::{self, BUILT_WITHOUT},
     tile::{Area, Size},
 };
 
@@ -91,11 +91,13 @@ fn render(scene: &PreparedScene<PreparedBytes>, feature: usize) -> u64 {
     let size = Size::new(160, 90).expect("a size");
     // Else what mirrors sends light on, too.
     let secondary = FEATURES[feature].0 != "mirror";
-    let quality = Quality { sampling: Sampling::Fixed(8), secondary, ..Quality::default() };
-    let area = Area { x0: 0, y0: 0, width: 160, height: 90 };
+    let quality =
+        Quality { sampling: Sampling::fixed(8).unwrap(), secondary, ..Quality::default() };
     let go_on = &mut || ControlFlow::Continue(());
-    let settings = Settings { size, quality };
-    render_tile(scene, &settings, area, Isa::fastest(), go_on).expect("not stopped").tally.rays
+    render_tile(scene, &quality, Area::whole(size), Isa::fastest(), go_on)
+        .expect("not stopped")
+        .tally
+        .rays
 }
 
 /// A program and the scene that it renders, and what that takes.
@@ -182,7 +184,7 @@ fn run_one(feature: usize, times: u32) {
 /// Builds this program without a feature's code, in a folder of its own, so that no other build is
 /// disturbed.
 fn build_without(feature: &str) -> PathBuf {
-    assert!(left_out::FEATURES.contains(&feature), "{feature} cannot be left out");
+    assert!(testing::FEATURES.contains(&feature), "{feature} cannot be left out");
     let folder = Path::new(env!("CARGO_TARGET_TMPDIR")).join("ablation");
     let output = Command::new(env!("CARGO"))
         .args(["bench", "-p", "rtfarm-core", "--bench", "ablation", "--no-run"])

@@ -19,8 +19,8 @@ use rtfarm_core::{
     prepared::{PreparedBytes, PreparedScene},
     render::{Quality, Sampling, Settings, render_tile},
     scene::{Scene, Sphere, Viewport},
+    testing::{Probe, Probing},
     tile::{Area, Size},
-    trace::Probe,
 };
 
 const COUNTS: [usize; 5] = [1_000, 10_000, 100_000, 1_000_000, 4_000_000];
@@ -93,12 +93,15 @@ fn away(mut scene: Scene) -> Scene {
 
 fn render(scene: &PreparedScene<PreparedBytes>) -> f64 {
     let size = Size::new(320, 180).expect("a size");
-    let settings =
-        Settings { size, quality: Quality { sampling: Sampling::Fixed(4), ..Quality::default() } };
-    let area = Area { x0: 0, y0: 0, width: size.width(), height: size.height() };
+    let settings = Settings {
+        size,
+        quality: Quality { sampling: Sampling::fixed(4).unwrap(), ..Quality::default() },
+    };
+    let area = Area::whole(size);
     let start = Instant::now();
     let on_progress = &mut || ControlFlow::Continue(());
-    render_tile(scene, &settings, area, Isa::fastest(), on_progress).expect("nobody stops it");
+    render_tile(scene, &settings.quality, area, Isa::fastest(), on_progress)
+        .expect("nobody stops it");
     start.elapsed().as_secs_f64()
 }
 

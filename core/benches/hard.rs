@@ -15,10 +15,11 @@ use rtfarm_core::{
     isa::Isa,
     prepare::prepare,
     prepared::PreparedScene,
-    render::{Quality, Sampling, Settings, render_tile},
+    render::{Quality, Sampling, render_tile},
     scene::{Scene, Viewport},
     tile::{Area, Size},
 };
+use rtfarm_oracle::hard_case::HardCase;
 
 const FACES: usize = 100_000;
 const ROUNDS: usize = 9;
@@ -27,13 +28,19 @@ fn main() {
     let plain = tilted(0.0);
     let denormal = tilted(1e-310);
     let ratio = ratio_of_medians(|| picture(&denormal), || picture(&plain));
-    println!("case 24: denormal coordinates and directions, time over that of zeros: {ratio:.2}");
+    let row = HardCase::Denormal.row();
+    println!(
+        "case {row}: denormal coordinates and directions, time over that of zeros: {ratio:.2}"
+    );
 
     let normal = bottle(FACES);
     let coincident = coincident();
     let build = |scene: &Scene| drop(prepare(scene).expect("a plain scene"));
     let ratio = ratio_of_medians(|| build(&coincident), || build(&normal));
-    println!("case 28: preparing 1e5 coincident triangles, time over that of a mesh: {ratio:.2}");
+    let row = HardCase::ManyFacesInOnePlace.row();
+    println!(
+        "case {row}: preparing 1e5 coincident triangles, time over that of a mesh: {ratio:.2}"
+    );
 }
 
 /// Seconds of one over seconds of the other: medians of runs in turns.
@@ -85,9 +92,7 @@ fn coincident() -> Scene {
 fn picture(scene: &Scene) {
     let scene = PreparedScene::open(prepare(scene).expect("a plain scene")).expect("valid");
     let size = Size::new(160, 120).expect("a size");
-    let quality = Quality { sampling: Sampling::Fixed(4), ..Quality::default() };
-    let settings = Settings { size, quality };
-    let area = Area { x0: 0, y0: 0, width: 160, height: 120 };
+    let quality = Quality { sampling: Sampling::fixed(4).unwrap(), ..Quality::default() };
     let go_on = &mut || ControlFlow::Continue(());
-    render_tile(&scene, &settings, area, Isa::fastest(), go_on);
+    render_tile(&scene, &quality, Area::whole(size), Isa::fastest(), go_on);
 }

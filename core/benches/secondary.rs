@@ -1,5 +1,6 @@
-//! Light that faces send on: how much sooner a picture is as good when rays are aimed at emitters,
-//! against rays over the whole sky alone by the same kernel; and how far off single pixels are.
+//! Light that faces send on: how much sooner a picture is as good when rays are aimed at emitters
+//! than when all go over the whole hemisphere, by the same kernel; and how far off single pixels
+//! are.
 //!
 //!     cargo bench -p rtfarm-core --bench secondary
 //!
@@ -14,10 +15,11 @@ use std::{env, fs, ops::ControlFlow, path::Path, time::Instant};
 
 use rtfarm_core::{
     isa::Isa,
-    prepare::{prepare, prepare_with},
+    prepare::prepare,
     prepared::{PreparedBytes, PreparedScene},
     read::read_scene,
     render::{Quality, RenderedTile, Sampling, Settings, render_tile},
+    testing::prepare_without_emitter_records,
     tile::{Area, Size},
 };
 
@@ -53,7 +55,7 @@ fn ways(name: &str) -> [(&'static str, Block); 2] {
     let scene = read_scene(&text, &nothing).scene.expect("a scene without a fault");
     let open = |bytes| PreparedScene::open(bytes).expect("a valid block");
     [
-        ("spread", open(prepare_with(&scene, false).expect("a scene"))),
+        ("spread", open(prepare_without_emitter_records(&scene).expect("a scene"))),
         ("aimed", open(prepare(&scene).expect("a scene"))),
     ]
 }
@@ -116,10 +118,15 @@ fn secondary_light(scene: &Block, samples: u32, seed: u64) -> (Vec<f64>, f64, u6
 
 fn picture(scene: &Block, samples: u32, seed: u64, secondary: bool) -> RenderedTile {
     let size = Size::new(96, 54).expect("a size");
-    let quality =
-        Quality { sampling: Sampling::Fixed(samples), seed, secondary, ..Quality::default() };
-    let area = Area { x0: 0, y0: 0, width: size.width(), height: size.height() };
+    let quality = Quality {
+        sampling: Sampling::fixed(samples).unwrap(),
+        seed,
+        secondary,
+        ..Quality::default()
+    };
+    let area = Area::whole(size);
     let on_progress = &mut || ControlFlow::Continue(());
     let settings = Settings { size, quality };
-    render_tile(scene, &settings, area, Isa::fastest(), on_progress).expect("nobody stops it")
+    render_tile(scene, &settings.quality, area, Isa::fastest(), on_progress)
+        .expect("nobody stops it")
 }

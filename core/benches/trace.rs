@@ -51,7 +51,7 @@ fn main() {
     for flat in [true, false] {
         let settings = Settings {
             size,
-            quality: Quality { sampling: Sampling::Fixed(1), flat, ..Quality::default() },
+            quality: Quality { sampling: Sampling::fixed(1).unwrap(), flat, ..Quality::default() },
         };
         for isa in Isa::ALL.into_iter().filter(|isa| isa.is_supported()) {
             for threads in [1, 2] {
@@ -63,7 +63,7 @@ fn main() {
                     rays = pool.install(|| {
                         let tile = |tile| {
                             let on = &mut || ControlFlow::Continue(());
-                            render_tile(&prepared, &settings, grid.area(tile), isa, on)
+                            render_tile(&prepared, &settings.quality, grid.area(tile), isa, on)
                         };
                         let order = grid.render_order();
                         order

@@ -6,7 +6,7 @@
 // What every room may speak of.
 mod exact;
 pub mod isa;
-pub mod left_out;
+mod left_out;
 pub mod sample;
 pub mod scene;
 mod text;
@@ -23,14 +23,12 @@ pub mod prepared;
 
 // A prepared scene into tiles.
 mod light;
-pub mod picture;
 pub mod render;
 mod shade;
-pub mod trace;
+mod trace;
+
+#[doc(hidden)]
+pub mod testing;
 
 pub use assets::{mesh as mesh_file, texture};
 pub use language::reader as read;
-
-#[cfg(test)]
-#[path = "../tests/long/mod.rs"]
-mod long;

@@ -81,8 +81,8 @@ impl Sample {
 pub(crate) struct GatherNumbers(Sample);
 
 impl GatherNumbers {
-    /// Whether it is sent.
-    pub(crate) fn sending(&self) -> f64 {
+    /// Decides by Russian roulette whether the ray is sent.
+    pub(crate) fn roulette(&self) -> f64 {
         self.fraction(1)
     }
 

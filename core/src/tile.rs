@@ -1,6 +1,6 @@
 //! Frames, tiles and the order in which tiles are rendered.
 
-use std::fmt;
+use std::{fmt, ops::Range};
 
 /// The size of a frame in pixels. Each side lies in `1..=Size::MAX_SIDE`, so that pixel
 /// coordinates fit in 16 bits and pixel counts in 32.
@@ -56,23 +56,108 @@ impl fmt::Display for Size {
     }
 }
 
-/// A rectangle of pixels inside a frame: `x0..x0 + width`, `y0..y0 + height`, y downwards.
+/// A rectangle of pixels of a frame, y downwards. It has at least one pixel and lies inside its
+/// frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct Area {
-    /// The leftmost column.
-    pub x0: u32,
-    /// The topmost row.
-    pub y0: u32,
-    /// Columns, at least 1.
-    pub width: u32,
-    /// Rows, at least 1.
-    pub height: u32,
+    frame: Size,
+    x0: u32,
+    y0: u32,
+    width: u32,
+    height: u32,
 }
 
 impl Area {
+    /// The pixels `x0..x0 + width` of the rows `y0..y0 + height`; `None` where that is no pixel at
+    /// all or where the frame does not have all of them.
+    pub fn new(frame: Size, [x0, y0]: [u32; 2], [width, height]: [u32; 2]) -> Option<Self> {
+        let is_within = |start: u32, length: u32, limit: u32| {
+            length > 0 && start.checked_add(length).is_some_and(|end| end <= limit)
+        };
+        let is_inside = is_within(x0, width, frame.width) && is_within(y0, height, frame.height);
+        is_inside.then_some(Self { frame, x0, y0, width, height })
+    }
+
+    /// The whole of a frame.
+    pub fn whole(frame: Size) -> Self {
+        Self { frame, x0: 0, y0: 0, width: frame.width, height: frame.height }
+    }
+
+    /// The frame that it is a part of.
+    pub fn frame(self) -> Size {
+        self.frame
+    }
+
+    /// The leftmost column.
+    pub fn x0(self) -> u32 {
+        self.x0
+    }
+
+    /// The topmost row.
+    pub fn y0(self) -> u32 {
+        self.y0
+    }
+
+    /// Columns, at least 1.
+    pub fn width(self) -> u32 {
+        self.width
+    }
+
+    /// Rows, at least 1.
+    pub fn height(self) -> u32 {
+        self.height
+    }
+
     /// Pixels in the rectangle.
     pub fn pixel_count(self) -> usize {
         self.width as usize * self.height as usize
+    }
+
+    /// Its columns in the frame.
+    pub fn columns(self) -> Range<u32> {
+        self.x0..self.x0 + self.width
+    }
+
+    /// Its rows in the frame.
+    pub fn rows(self) -> Range<u32> {
+        self.y0..self.y0 + self.height
+    }
+
+    /// Its pixels (x, y) of the frame, row by row.
+    pub fn pixels(self) -> impl Iterator<Item = (u32, u32)> {
+        self.rows().flat_map(move |y| self.columns().map(move |x| (x, y)))
+    }
+
+    /// The pixel (x, y) of the frame, as its place among those of the area, row by row.
+    pub fn index_of(self, x: u32, y: u32) -> u32 {
+        (y - self.y0) * self.width + (x - self.x0)
+    }
+
+    /// The pixel (x, y) of the frame at a place among those of the area, row by row.
+    pub fn pixel_at(self, index: u32) -> (u32, u32) {
+        (self.x0 + index % self.width, self.y0 + index / self.width)
+    }
+
+    /// The area and the pixels around it that the frame has.
+    pub(crate) fn with_rim(self) -> Self {
+        let (x0, y0) = (self.x0.saturating_sub(1), self.y0.saturating_sub(1));
+        let width = self.frame.width.min(self.x0 + self.width + 1) - x0;
+        let height = self.frame.height.min(self.y0 + self.height + 1) - y0;
+        Self { x0, y0, width, height, ..self }
+    }
+
+    /// The area cut into squares of `side` pixels, row by row; those at the right and bottom edge
+    /// may be narrower.
+    pub(crate) fn blocks(self, side: u32) -> impl Iterator<Item = Self> {
+        (0..self.height).step_by(side as usize).flat_map(move |y| {
+            (0..self.width).step_by(side as usize).map(move |x| Self {
+                x0: self.x0 + x,
+                y0: self.y0 + y,
+                width: side.min(self.width - x),
+                height: side.min(self.height - y),
+                ..self
+            })
+        })
     }
 }
 
@@ -162,6 +247,7 @@ impl TileGrid {
     pub fn area(self, tile: TileId) -> Area {
         let (x0, y0) = (tile.0 % self.columns() * self.side, tile.0 / self.columns() * self.side);
         Area {
+            frame: self.size,
             x0,
             y0,
             width: self.side.min(self.size.width - x0),
@@ -222,10 +308,8 @@ mod tests {
         let mut seen = vec![0; 101 * 67];
         for tile in grid.render_order() {
             let area = grid.area(tile);
-            for y in area.y0..area.y0 + area.height {
-                for x in area.x0..area.x0 + area.width {
-                    seen[(y * 101 + x) as usize] += 1;
-                }
+            for (x, y) in area.pixels() {
+                seen[(y * 101 + x) as usize] += 1;
             }
         }
         assert!(seen.iter().all(|&count| count == 1));
@@ -246,6 +330,36 @@ mod tests {
         assert_eq!(TileGrid::balanced(Size::new(1280, 720).unwrap()).side(), 32);
         assert_eq!(TileGrid::balanced(Size::new(16_384, 16_384).unwrap()).side(), 256);
         assert_eq!(TileGrid::balanced(Size::new(1, 1).unwrap()).count(), 1);
+    }
+
+    #[test]
+    fn an_area_lies_in_its_frame() {
+        let frame = Size::new(10, 6).unwrap();
+        assert_eq!(Area::new(frame, [0, 0], [10, 6]), Some(Area::whole(frame)));
+        for (start, sides) in [
+            ([0, 0], [11, 6]),
+            ([0, 0], [10, 7]),
+            ([9, 5], [2, 1]),
+            ([10, 0], [1, 1]),
+            ([0, 0], [0, 1]),
+            ([0, 0], [1, 0]),
+            ([1, 1], [u32::MAX, 1]),
+        ] {
+            assert_eq!(Area::new(frame, start, sides), None, "{start:?} {sides:?}");
+        }
+    }
+
+    #[test]
+    fn blocks_cover_an_area_once_and_its_rim_stays_in_the_frame() {
+        let frame = Size::new(10, 6).unwrap();
+        let area = Area::new(frame, [3, 1], [7, 5]).unwrap();
+        let mut pixels: Vec<(u32, u32)> = area.blocks(4).flat_map(Area::pixels).collect();
+        pixels.sort_unstable_by_key(|&(x, y)| (y, x));
+        assert_eq!(pixels, area.pixels().collect::<Vec<_>>());
+        assert_eq!(Some(area.with_rim()), Area::new(frame, [2, 0], [8, 6]));
+        for (index, (x, y)) in (0..).zip(area.pixels()) {
+            assert_eq!((area.index_of(x, y), area.pixel_at(index)), (index, (x, y)));
+        }
     }
 
     #[test]

@@ -2,12 +2,12 @@
 
 use prost::bytes::Bytes;
 use rtfarm_core::{
-    picture::PictureFormat,
     prepared::SceneHash,
-    render::{Quality, Sampling, Settings, Tally},
+    render::{Cutoff, Quality, SampleLimit, Sampling, Settings, StandardError, Tally},
     tile::{Size, SizeError},
     transfer::Transfer,
 };
+use rtfarm_picture::PictureFormat;
 
 use crate::wire;
 
@@ -79,26 +79,17 @@ impl TryFrom<wire::Quality> for Quality {
     fn try_from(quality: wire::Quality) -> Result<Self, WireError> {
         let wire::Quality { sampling, seed, flat, secondary, cutoff } = quality;
         let sampling = match sampling.ok_or(WireError::Missing("sampling"))? {
-            wire::quality::Sampling::Samples(count) => Sampling::Fixed(count),
+            wire::quality::Sampling::Samples(count) => {
+                Sampling::fixed(count).ok_or(WireError::Samples(count))?
+            }
             wire::quality::Sampling::Adaptive(wire::Adaptive { error, most }) => {
-                Sampling::Adaptive { error, most }
+                Sampling::Adaptive {
+                    error: StandardError::new(error).ok_or(WireError::Error(error))?,
+                    most: SampleLimit::new(most).ok_or(WireError::Samples(most))?,
+                }
             }
         };
-        match sampling {
-            Sampling::Fixed(count) if !Sampling::COUNTS.contains(&count) => {
-                return Err(WireError::Samples(count));
-            }
-            Sampling::Adaptive { most, .. } if !Sampling::MOST_COUNTS.contains(&most) => {
-                return Err(WireError::Samples(most));
-            }
-            Sampling::Adaptive { error, .. } if !Sampling::is_error(error) => {
-                return Err(WireError::Error(error));
-            }
-            _ => {}
-        }
-        if !(0.0..=1.0).contains(&cutoff) {
-            return Err(WireError::Cutoff(cutoff));
-        }
+        let cutoff = Cutoff::new(cutoff).ok_or(WireError::Cutoff(cutoff))?;
         Ok(Self { sampling, seed, flat, secondary, cutoff })
     }
 }
@@ -107,12 +98,13 @@ impl From<Quality> for wire::Quality {
     fn from(quality: Quality) -> Self {
         let Quality { sampling, seed, flat, secondary, cutoff } = quality;
         let sampling = Some(match sampling {
-            Sampling::Fixed(count) => wire::quality::Sampling::Samples(count),
+            Sampling::Fixed(count) => wire::quality::Sampling::Samples(count.get()),
             Sampling::Adaptive { error, most } => {
+                let (error, most) = (error.get(), most.get());
                 wire::quality::Sampling::Adaptive(wire::Adaptive { error, most })
             }
         });
-        Self { sampling, seed, flat, secondary, cutoff }
+        Self { sampling, seed, flat, secondary, cutoff: cutoff.get() }
     }
 }
 

@@ -8,9 +8,10 @@ mod name;
 
 pub use address::{Address, AddressError};
 pub use convert::{WireError, pixels_from_bytes, pixels_to_bytes, scene_hash, transfer};
-pub use name::{Epoch, JobId, LeaseName, WorkerId};
+pub use name::{JobId, LeaseId, LeaseName, WorkerId};
+pub use prost::bytes::Bytes;
 
-/// The generated messages, clients and servers.
+/// The messages, clients and servers that `proto/generate` writes from `farm.proto`.
 #[expect(
     missing_docs,
     clippy::pedantic,
@@ -18,7 +19,7 @@ pub use name::{Epoch, JobId, LeaseName, WorkerId};
     reason = "generated; farm.proto has the words"
 )]
 pub mod wire {
-    tonic::include_proto!("rtfarm.v1");
+    include!("generated/rtfarm.v1.rs");
 }
 
 /// The version of `farm.proto`. Both sides must have the same, and the same package version.

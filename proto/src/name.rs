@@ -1,4 +1,4 @@
-//! What is numbered: workers, jobs, leases.
+//! The numbers of workers, jobs and leases.
 
 use std::fmt;
 
@@ -8,21 +8,21 @@ use crate::wire;
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub struct WorkerId(pub u32);
 
-/// A picture being rendered. Numbers are never given twice.
+/// A job: a picture that somebody ordered. Numbers are never given twice.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub struct JobId(pub u64);
 
-/// A lease among all of a coordinator's life. Numbers are never given twice.
+/// A lease, numbered over all jobs of a coordinator. Numbers are never given twice.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
-pub struct Epoch(pub u64);
+pub struct LeaseId(pub u64);
 
-/// A lease and the job whose tiles it is for.
+/// Names a lease and the job whose tiles it covers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub struct LeaseName {
     /// The job.
     pub job: JobId,
-    /// Which of its leases.
-    pub epoch: Epoch,
+    /// The lease.
+    pub id: LeaseId,
 }
 
 impl fmt::Display for WorkerId {
@@ -39,12 +39,12 @@ impl fmt::Display for JobId {
 
 impl From<wire::LeaseName> for LeaseName {
     fn from(name: wire::LeaseName) -> Self {
-        Self { job: JobId(name.job), epoch: Epoch(name.epoch) }
+        Self { job: JobId(name.job), id: LeaseId(name.id) }
     }
 }
 
 impl From<LeaseName> for wire::LeaseName {
     fn from(name: LeaseName) -> Self {
-        Self { job: name.job.0, epoch: name.epoch.0 }
+        Self { job: name.job.0, id: name.id.0 }
     }
 }

@@ -1,8 +1,8 @@
-/* What Embree 3 meets of the rays that `rtfarm report --for-peers FOLDER` wrote.
+/* What Embree 3 meets of the rays that `rtfarm-report --for-peers FOLDER` wrote.
  *
  *     gcc -O3 -o embree embree.c -lembree3 && ./embree FOLDER RUNS MOVED...
  *
- * Leaves the distances as `rtfarm report --peers` reads them and prints a line of kernels.tsv each:
+ * Leaves the distances as `rtfarm-report --peers` reads them and prints a line of kernels.tsv each:
  * one thread, one ray a call, the fast and the robust mode by turns. The time includes the copy of
  * a ray into Embree's own form. */
 #include <embree3/rtcore.h>

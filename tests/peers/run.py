@@ -1,6 +1,6 @@
 #!/usr/bin/env python3
-"""Run other renderers on what `rtfarm report --for-peers FOLDER` wrote; leave what they made for
-`rtfarm report --peers FOLDER`.
+"""Run other renderers on what `rtfarm-report --for-peers FOLDER` wrote; leave what they made for
+`rtfarm-report --peers FOLDER`.
 
     python3 run.py FOLDER CONVERTERS [--runs 9] [--most 256]
 

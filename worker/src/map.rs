@@ -1,4 +1,4 @@
-//! Files in memory without being read: all workers of a machine share one copy of a scene.
+//! Maps files into memory, so that all workers of a machine share one copy of a scene.
 
 use std::{fs::File, io};
 

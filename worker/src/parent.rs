@@ -5,11 +5,11 @@ use rustix::process::{Pid, Signal, getppid, set_parent_process_death_signal};
 /// Why a worker cannot be tied to its parent.
 #[derive(Debug, thiserror::Error)]
 pub enum ParentError {
-    /// It is gone already, or was another process.
+    /// That process has ended, or did not start this one.
     #[error("the process {0} that started this worker is gone")]
     Gone(u32),
     /// The system refuses.
-    #[error("cannot be tied to the parent's life: {0}")]
+    #[error("cannot tie this worker's life to the process that started it: {0}")]
     System(#[from] rustix::io::Errno),
 }
 

@@ -1,4 +1,4 @@
-//! Signs of progress, on their way from the threads that render to the coordinator.
+//! Carries signs of progress from the threads that render to where the worker decides.
 
 use std::{
     sync::atomic::{AtomicU64, Ordering},
@@ -7,7 +7,7 @@ use std::{
 
 use tokio::{sync::mpsc, time::Instant};
 
-/// Beaten by whoever makes progress; heard at most once a period.
+/// Whoever makes progress beats it; it is heard at most once a period.
 #[derive(Debug)]
 pub(crate) struct Pulse {
     start: Instant,
@@ -18,13 +18,13 @@ pub(crate) struct Pulse {
 }
 
 impl Pulse {
-    /// A pulse, and where its beats are heard.
+    /// Makes a pulse, and the place where its beats are heard.
     pub(crate) fn new(period: Duration) -> (Self, mpsc::Receiver<()>) {
         let (send, receive) = mpsc::channel(1);
         (Self { start: Instant::now(), period, next_beat: AtomicU64::new(0), send }, receive)
     }
 
-    /// Some work was done.
+    /// Event: some work was done.
     pub(crate) fn beat(&self) {
         let now = self.start.elapsed().as_millis() as u64;
         let next = self.next_beat.load(Ordering::Relaxed);
@@ -35,7 +35,7 @@ impl Pulse {
                 .compare_exchange(next, after, Ordering::Relaxed, Ordering::Relaxed)
                 .is_ok();
         if is_due {
-            // Full: one is waiting to be heard already.
+            // When the channel is full, a beat waits to be heard already.
             let _ = self.send.try_send(());
         }
     }

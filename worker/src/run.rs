@@ -1,10 +1,11 @@
-//! A worker's life: it joins, asks for tiles, has them rendered, brings them, leaves.
+//! A worker as a process: it does what [`Worker`] decides, and tells it what came of it.
 
 use std::{
-    collections::BTreeMap,
+    collections::HashMap,
     future::pending,
     ops::ControlFlow,
-    pin::{Pin, pin},
+    panic::resume_unwind,
+    pin::pin,
     sync::{
         Arc,
         atomic::{AtomicBool, Ordering},
@@ -12,99 +13,55 @@ use std::{
     time::Duration,
 };
 
-use backon::{ExponentialBuilder, Retryable};
-use rayon::{ThreadPool, ThreadPoolBuildError, ThreadPoolBuilder};
-use rtfarm_core::{isa::Isa, prepared::SceneHash, render::render_tile, tile::TileId};
+use rayon::{ThreadPool, ThreadPoolBuilder};
+use rtfarm_core::{prepared::SceneHash, render::render_tile, tile::TileId};
 use rtfarm_proto::{
-    Address, LONGEST_WAIT, LeaseName, MESSAGE_BYTES, PROTOCOL, WorkerId, pixels_to_bytes,
-    wire::{self, farm_client::FarmClient, lease_response::Next},
+    LeaseName, pixels_to_bytes,
+    wire::{self, farm_client::FarmClient},
 };
-use tokio::{sync::mpsc, task::JoinSet, time::Instant};
-use tonic::{Code, Response, Status, transport::Channel};
+use tokio::{
+    sync::mpsc,
+    task::{AbortHandle, JoinError, JoinSet},
+    time::Instant,
+};
+use tonic::transport::Channel;
 
 use crate::{
+    call::{Answer, Call, CallError, Delivery},
+    client,
+    config::Config,
+    error::WorkerError,
+    job::Job,
     pulse::Pulse,
-    scene::{Description, Scene, SceneError, load},
+    scene::{Scene, SceneError, load},
+    task::{Action, TaskId},
+    worker::Worker,
 };
-
-/// How a worker works.
-#[derive(Debug, Clone)]
-pub struct Config {
-    /// Where its coordinator is.
-    pub coordinator: Address,
-    /// Threads that render, at least 1.
-    pub threads: usize,
-    /// What they render with.
-    pub isa: Isa,
-    /// The version of the package; the coordinator must have the same.
-    pub version: String,
-    /// How long it goes on without a coordinator.
-    pub patience: Duration,
-}
-
-/// Why a worker ends before it is told to.
-#[derive(Debug, thiserror::Error)]
-pub enum WorkerError {
-    /// There is nobody at the address.
-    #[error("no coordinator answers at {0}: {1}")]
-    Connect(Address, String),
-    /// The coordinator will not have it.
-    #[error("the coordinator refuses this worker: {}", .0.message())]
-    Refused(Status),
-    /// The coordinator is not heard of any more.
-    #[error("the coordinator is gone: {}", .0.message())]
-    Gone(Status),
-    /// A job cannot be worked on.
-    #[error(transparent)]
-    Scene(#[from] SceneError),
-    /// No threads.
-    #[error("cannot start threads: {0}")]
-    Threads(#[from] ThreadPoolBuildError),
-    /// No random number.
-    #[error("the system gives no random numbers: {0}")]
-    Random(#[from] rustix::io::Errno),
-}
-
-/// The longest that a short question may wait for its answer.
-const DEADLINE: Duration = Duration::from_secs(15);
-
-/// Tiles that a thread may have before it, so that it never waits for the network.
-const TILES_AHEAD: usize = 2;
 
 /// Works for the coordinator until that sends it home or `shutdown` comes.
 pub async fn run(config: Config, shutdown: impl Future<Output = ()>) -> Result<(), WorkerError> {
-    let mut shutdown = pin!(shutdown);
-    let pool = ThreadPoolBuilder::new()
-        .num_threads(config.threads)
-        .thread_name(|index| format!("render-{index}"))
-        .build()?;
     let nonce = random()?;
-    let mut client = tokio::select! {
-        client = connect(&config) => client?,
-        () = &mut shutdown => return Ok(()),
-    };
+    let mut worker = Worker::new(&config, nonce, now());
+    let mut shell = Shell::new(config, nonce)?;
+    let mut shutdown = pin!(shutdown);
+    let mut is_stopped = false;
     loop {
-        let member = tokio::select! {
-            member = join(&config, &client, nonce) => member?,
-            () = &mut shutdown => return Ok(()),
-        };
-        let ended = tokio::select! {
-            ended = member.work(&pool) => ended,
-            () = &mut shutdown => {
-                member.leave("it was stopped").await;
-                return Ok(());
+        while let Some(action) = worker.next_action() {
+            if let ControlFlow::Break(exit) = shell.execute(action) {
+                return exit;
             }
-        };
-        match ended {
-            Ok(()) => return Ok(()),
-            // The coordinator does not know this worker any more.
-            Err(WorkerError::Gone(status)) if status.code() == Code::NotFound => {
-                tracing::warn!(reason = status.message(), "joining again");
-                client = member.client;
+        }
+        tokio::select! {
+            Some(report) = shell.reports.join_next() => shell.pass_on(report, &mut worker),
+            Some((task, tile)) = shell.rendered.recv() => {
+                shell.renderings.remove(&task);
+                worker.on_tile_rendered(task, tile, now());
             }
-            Err(error) => {
-                member.leave(&error.to_string()).await;
-                return Err(error);
+            Some(()) = shell.beats.recv() => worker.on_beat(now()),
+            () = sleep_until(worker.wake_at()) => worker.on_tick(now()),
+            () = &mut shutdown, if !is_stopped => {
+                is_stopped = true;
+                worker.on_stop(now());
             }
         }
     }
@@ -116,341 +73,191 @@ fn random() -> rustix::io::Result<u64> {
     Ok(u64::from_ne_bytes(bytes))
 }
 
-async fn connect(config: &Config) -> Result<FarmClient<Channel>, WorkerError> {
-    let connect = || config.coordinator.connect();
-    let channel = connect.retry(backoff(config.patience)).await.map_err(|error| {
-        let mut reason: &dyn std::error::Error = &error;
-        while let Some(source) = reason.source() {
-            reason = source;
-        }
-        WorkerError::Connect(config.coordinator.clone(), reason.to_string())
-    })?;
-    Ok(FarmClient::new(channel)
-        .max_decoding_message_size(MESSAGE_BYTES)
-        .max_encoding_message_size(MESSAGE_BYTES))
+fn now() -> std::time::Instant {
+    Instant::now().into_std()
 }
 
-fn backoff(patience: Duration) -> ExponentialBuilder {
-    ExponentialBuilder::default()
-        .with_jitter()
-        .with_min_delay(Duration::from_millis(50))
-        .with_max_delay(Duration::from_secs(2))
-        .with_total_delay(Some(patience))
-        .without_max_times()
+/// Waits for a moment; for ever when there is none.
+async fn sleep_until(moment: Option<std::time::Instant>) {
+    match moment {
+        Some(moment) => tokio::time::sleep_until(Instant::from_std(moment)).await,
+        None => pending().await,
+    }
 }
 
-async fn join(
-    config: &Config,
-    client: &FarmClient<Channel>,
-    nonce: u64,
-) -> Result<Member, WorkerError> {
-    let request = wire::JoinRequest {
-        version: config.version.clone(),
-        protocol: PROTOCOL,
-        nonce,
-        threads: u32::try_from(config.threads).unwrap_or(u32::MAX),
-        isa: config.isa.to_string(),
-        host: rustix::system::uname().nodename().to_string_lossy().into_owned(),
-        process: std::process::id(),
-    };
-    let joined = call(config.patience, DEADLINE, || {
-        let (mut client, request) = (client.clone(), request.clone());
-        async move { client.join(request).await }
-    });
-    let joined = joined.await.map_err(|status| match status.code() {
-        Code::FailedPrecondition | Code::InvalidArgument => WorkerError::Refused(status),
-        _ => WorkerError::Gone(status),
-    })?;
-    let worker = WorkerId(joined.worker);
-    let term = Duration::from_millis(joined.term_ms.into());
-    tracing::info!(worker = worker.0, coordinator = %config.coordinator, "joined");
-    Ok(Member { config: config.clone(), client: client.clone(), worker, term })
-}
-
-/// Asks until there is an answer. A coordinator that is there but slow is waited for; one that
-/// is not there, for as long as `patience` lasts.
-async fn call<T, F>(
-    patience: Duration,
-    deadline: Duration,
-    ask: impl Fn() -> F,
-) -> Result<T, Status>
-where
-    F: Future<Output = Result<Response<T>, Status>>,
-{
-    let attempt = || async {
-        match tokio::time::timeout(deadline, ask()).await {
-            Ok(answer) => answer.map(Response::into_inner),
-            Err(_) => Err(Status::deadline_exceeded("no answer in time")),
-        }
-    };
-    let is_transient = |status: &Status| {
-        matches!(
-            status.code(),
-            Code::Unavailable
-                | Code::DeadlineExceeded
-                | Code::Unknown
-                | Code::Cancelled
-                | Code::DataLoss
-        )
-    };
-    let notify = |status: &Status, delay: Duration| {
-        tracing::debug!(reason = status.message(), ?delay, "asking again");
-    };
-    attempt.retry(backoff(patience)).when(is_transient).notify(notify).await
-}
-
-/// A worker that has joined.
-struct Member {
+/// The tasks that run, and what they need.
+struct Shell {
     config: Config,
-    client: FarmClient<Channel>,
-    worker: WorkerId,
-    term: Duration,
+    introduction: Arc<wire::JoinRequest>,
+    client: Option<FarmClient<Channel>>,
+    scenes: HashMap<SceneHash, Arc<Scene>>,
+    /// Calls and fetches.
+    reports: JoinSet<(TaskId, Report)>,
+    /// How each of them is stopped.
+    running: HashMap<TaskId, AbortHandle>,
+    pool: ThreadPool,
+    renderings: HashMap<TaskId, Rendering>,
+    send_rendered: mpsc::Sender<(TaskId, Option<Delivery>)>,
+    rendered: mpsc::Receiver<(TaskId, Option<Delivery>)>,
+    pulse: Arc<Pulse>,
+    beats: mpsc::Receiver<()>,
 }
 
-/// The leases that a member knows to have. Dropping one stops the rendering under it.
-#[derive(Default)]
-struct Held(BTreeMap<LeaseName, Lease>);
-
-struct Lease {
-    is_over: Arc<AtomicBool>,
-    /// Tiles that wait or are being rendered.
-    tiles_left: usize,
+/// What came of a call or a fetch.
+enum Report {
+    Connected(FarmClient<Channel>),
+    Answered(Answer),
+    Failed(CallError),
+    Fetched(SceneHash, Arc<Scene>),
+    FetchFailed(SceneError),
 }
 
-impl Drop for Lease {
+/// A tile in the hands of the threads. Dropping this stops it.
+struct Rendering {
+    is_stopped: Arc<AtomicBool>,
+}
+
+impl Drop for Rendering {
     fn drop(&mut self) {
-        self.is_over.store(true, Ordering::Relaxed);
+        self.is_stopped.store(true, Ordering::Relaxed);
     }
 }
 
-impl Held {
-    fn tiles_left(&self) -> usize {
-        self.0.values().map(|lease| lease.tiles_left).sum()
+impl Shell {
+    fn new(config: Config, nonce: u64) -> Result<Self, WorkerError> {
+        let pool = ThreadPoolBuilder::new()
+            .num_threads(config.threads)
+            .thread_name(|index| format!("render-{index}"))
+            .build()?;
+        let (send_rendered, rendered) = mpsc::channel(config.threads);
+        // Nothing beats before the worker has joined and chosen the period.
+        let (pulse, beats) = Pulse::new(Duration::ZERO);
+        Ok(Self {
+            introduction: Arc::new(client::introduction(&config, nonce)),
+            config,
+            client: None,
+            scenes: HashMap::new(),
+            reports: JoinSet::new(),
+            running: HashMap::new(),
+            pool,
+            renderings: HashMap::new(),
+            send_rendered,
+            rendered,
+            pulse: Arc::new(pulse),
+            beats,
+        })
     }
 
-    fn on_tile_rendered(&mut self, name: LeaseName) {
-        if let Some(lease) = self.0.get_mut(&name) {
-            lease.tiles_left -= 1;
-            if lease.tiles_left == 0 {
-                self.0.remove(&name);
-            }
-        }
-    }
-}
-
-/// A run of tiles whose scene has to be brought.
-struct Run {
-    lease: LeaseName,
-    tiles: Vec<TileId>,
-    job: Description,
-}
-
-/// A tile that a thread has done with.
-struct Rendered {
-    lease: LeaseName,
-    /// Ready to be sent, unless the work was stopped.
-    delivery: Option<wire::DeliverRequest>,
-}
-
-type Slot<T> = Option<Pin<Box<dyn Future<Output = T> + Send>>>;
-
-/// Waits for the future in a slot; for ever when there is none.
-async fn finished<T>(slot: &mut Slot<T>) -> T {
-    let Some(future) = slot else { return pending().await };
-    let output = future.await;
-    *slot = None;
-    output
-}
-
-impl Member {
-    /// Renders what there is to render, until sent home.
-    async fn work(&self, pool: &ThreadPool) -> Result<(), WorkerError> {
-        let threads = pool.current_num_threads();
-        let (pulse, mut beats) = Pulse::new(self.term / 4);
-        let pulse = Arc::new(pulse);
-        let (send, mut rendered) = mpsc::channel(threads);
-        let mut held = Held::default();
-        let mut scene: Option<(SceneHash, Arc<Scene>)> = None;
-        let mut asking: Slot<Result<Next, WorkerError>> = None;
-        let mut loading: Slot<Result<(Run, Arc<Scene>), SceneError>> = None;
-        let mut renewing: Slot<Result<Vec<LeaseName>, WorkerError>> = None;
-        let mut delivering: JoinSet<Result<(), WorkerError>> = JoinSet::new();
-
-        loop {
-            let is_short = held.tiles_left() < TILES_AHEAD * threads;
-            if is_short && asking.is_none() && loading.is_none() {
-                asking = Some(Box::pin(self.ask((LONGEST_RUN_A_THREAD * threads) as u32)));
-            }
-            tokio::select! {
-                next = finished(&mut asking) => match next? {
-                    Next::Run(run) => {
-                        let run = read_run(run)?;
-                        let lease = Lease {
-                            is_over: Arc::default(),
-                            tiles_left: run.tiles.len(),
-                        };
-                        held.0.insert(run.lease, lease);
-                        let known = scene.clone().filter(|(hash, _)| *hash == run.job.hash);
-                        let (client, pulse) = (self.client.clone(), Arc::clone(&pulse));
-                        loading = Some(Box::pin(async move {
-                            let scene = match known {
-                                Some((_, scene)) => scene,
-                                None => load(run.job.clone(), client, pulse).await?,
-                            };
-                            Ok((run, scene))
-                        }));
-                    }
-                    Next::Nothing(_) => {}
-                    Next::ShutDown(_) => {
-                        tracing::info!(worker = self.worker.0, "sent home");
-                        return Ok(());
-                    }
-                },
-                loaded = finished(&mut loading) => {
-                    let (run, loaded) = loaded?;
-                    scene = Some((run.job.hash, Arc::clone(&loaded)));
-                    if let Some(lease) = held.0.get(&run.lease) {
-                        self.start(pool, &run, &loaded, &lease.is_over, &pulse, &send);
-                    }
-                }
-                Some(tile) = rendered.recv(), if delivering.len() < TILES_AHEAD * threads => {
-                    held.on_tile_rendered(tile.lease);
-                    if let Some(delivery) = tile.delivery {
-                        delivering.spawn(self.deliver(delivery));
-                    }
-                }
-                Some(delivered) = delivering.join_next() => match delivered {
-                    Ok(delivered) => delivered?,
-                    Err(error) => return Err(WorkerError::Gone(Status::internal(error.to_string()))),
-                },
-                Some(()) = beats.recv(), if renewing.is_none() && !held.0.is_empty() => {
-                    renewing = Some(Box::pin(self.renew(held.0.keys().copied().collect())));
-                }
-                lost = finished(&mut renewing) => {
-                    for name in lost? {
-                        if held.0.remove(&name).is_some() {
-                            tracing::info!(worker = self.worker.0, ?name, "lost a lease");
-                        }
-                    }
+    /// Does what was decided. Breaks when that is to end.
+    fn execute(&mut self, action: Action) -> ControlFlow<Result<(), WorkerError>> {
+        match action {
+            Action::Call(task, call) => self.call(task, call),
+            Action::Fetch { task, job, silence } => self.fetch(task, job, silence),
+            Action::Render { task, lease, tile, job } => self.render(task, lease, tile, job),
+            Action::Stop(task) => {
+                self.renderings.remove(&task);
+                if let Some(running) = self.running.remove(&task) {
+                    running.abort();
                 }
             }
+            Action::ForgetScene(scene) => drop(self.scenes.remove(&scene)),
+            Action::HearBeats { period } => {
+                let (pulse, beats) = Pulse::new(period);
+                (self.pulse, self.beats) = (Arc::new(pulse), beats);
+            }
+            Action::Exit(exit) => return ControlFlow::Break(exit),
         }
+        ControlFlow::Continue(())
     }
 
-    /// Has every tile of a run rendered, each as one job of the pool.
-    fn start(
-        &self,
-        pool: &ThreadPool,
-        run: &Run,
-        scene: &Arc<Scene>,
-        is_over: &Arc<AtomicBool>,
-        pulse: &Arc<Pulse>,
-        send: &mpsc::Sender<Rendered>,
-    ) {
-        for &tile in &run.tiles {
-            let (lease, job, worker) = (run.lease, run.job.clone(), self.worker);
-            let (scene, is_over) = (Arc::clone(scene), Arc::clone(is_over));
-            let (pulse, send, isa) = (Arc::clone(pulse), send.clone(), self.config.isa);
-            pool.spawn_fifo(move || {
-                let started = Instant::now();
-                let mut on_progress = || {
-                    pulse.beat();
-                    if is_over.load(Ordering::Relaxed) {
-                        ControlFlow::Break(())
-                    } else {
-                        ControlFlow::Continue(())
-                    }
-                };
-                let area = job.grid.area(tile);
-                let pixels = match on_progress() {
-                    ControlFlow::Continue(()) => {
-                        render_tile(&scene, &job.settings, area, isa, &mut on_progress)
-                    }
-                    ControlFlow::Break(()) => None,
-                };
-                let delivery = pixels.map(|tile_pixels| {
-                    let pixels = pixels_to_bytes(&tile_pixels.pixels);
-                    wire::DeliverRequest {
-                        worker: worker.0,
-                        lease: Some(lease.into()),
-                        tile: tile.number(),
-                        hash: blake3::hash(&pixels).as_bytes().to_vec().into(),
-                        pixels,
-                        tally: Some(tile_pixels.tally.into()),
-                        seconds: started.elapsed().as_secs_f64(),
-                    }
-                });
-                // Nobody listens when the worker is leaving.
-                let _ = send.blocking_send(Rendered { lease, delivery });
+    fn call(&mut self, task: TaskId, call: Call) {
+        let Some(client) = self.client.clone() else {
+            let address = self.config.coordinator.clone();
+            return self.start(task, async move {
+                client::connect(&address).await.map_or_else(Report::Failed, Report::Connected)
             });
+        };
+        let introduction = Arc::clone(&self.introduction);
+        self.start(task, async move {
+            let answer = client::ask(client, introduction, call).await;
+            answer.map_or_else(Report::Failed, Report::Answered)
+        });
+    }
+
+    fn fetch(&mut self, task: TaskId, job: Arc<Job>, silence: Duration) {
+        let client = self.client.clone().expect("a worker connects before it fetches");
+        let (scene, pulse) = (job.scene, Arc::clone(&self.pulse));
+        self.start(task, async move {
+            match load(job, silence, client, pulse).await {
+                Ok(loaded) => Report::Fetched(scene, loaded),
+                Err(error) => Report::FetchFailed(error),
+            }
+        });
+    }
+
+    fn start(&mut self, task: TaskId, work: impl Future<Output = Report> + Send + 'static) {
+        let handle = self.reports.spawn(async move { (task, work.await) });
+        self.running.insert(task, handle);
+    }
+
+    fn pass_on(&mut self, report: Result<(TaskId, Report), JoinError>, worker: &mut Worker) {
+        let (task, report) = match report {
+            Ok(report) => report,
+            Err(error) if error.is_panic() => resume_unwind(error.into_panic()),
+            // It was stopped.
+            Err(_) => return,
+        };
+        if self.running.remove(&task).is_none() {
+            // It was stopped a moment too late.
+            return;
+        }
+        match report {
+            Report::Connected(client) => {
+                self.client = Some(client);
+                worker.on_answer(task, Answer::Connected, now());
+            }
+            Report::Answered(answer) => worker.on_answer(task, answer, now()),
+            Report::Failed(error) => worker.on_call_failed(task, error, now()),
+            Report::Fetched(hash, scene) => {
+                self.scenes.insert(hash, scene);
+                worker.on_fetched(task, now());
+            }
+            Report::FetchFailed(error) => worker.on_fetch_failed(task, error, now()),
         }
     }
 
-    fn ask(&self, max_tiles: u32) -> impl Future<Output = Result<Next, WorkerError>> + use<> {
-        let (client, patience) = (self.client.clone(), self.config.patience);
-        let wait_ms = u32::try_from(LONGEST_WAIT.as_millis()).unwrap_or(u32::MAX);
-        let request = wire::LeaseRequest { worker: self.worker.0, max_tiles, wait_ms };
-        async move {
-            let answer = call(patience, LONGEST_WAIT + DEADLINE, || {
-                let mut client = client.clone();
-                async move { client.lease(request).await }
+    /// Has a tile rendered, as one job of the pool.
+    fn render(&mut self, task: TaskId, lease: LeaseName, tile: TileId, job: Arc<Job>) {
+        let is_stopped = Arc::new(AtomicBool::new(false));
+        self.renderings.insert(task, Rendering { is_stopped: Arc::clone(&is_stopped) });
+        let scene = Arc::clone(&self.scenes[&job.scene]);
+        let (pulse, send) = (Arc::clone(&self.pulse), self.send_rendered.clone());
+        let isa = self.config.isa;
+        self.pool.spawn_fifo(move || {
+            let started = Instant::now();
+            let mut on_progress = || {
+                pulse.beat();
+                if is_stopped.load(Ordering::Relaxed) {
+                    ControlFlow::Break(())
+                } else {
+                    ControlFlow::Continue(())
+                }
+            };
+            let area = job.grid.area(tile);
+            let rendered = match on_progress() {
+                ControlFlow::Continue(()) => {
+                    render_tile(&scene, &job.settings.quality, area, isa, &mut on_progress)
+                }
+                ControlFlow::Break(()) => None,
+            };
+            let delivery = rendered.map(|rendered| {
+                let pixels = pixels_to_bytes(&rendered.pixels);
+                let hash = *blake3::hash(&pixels).as_bytes();
+                let seconds = started.elapsed().as_secs_f64();
+                Delivery { lease, tile, pixels, hash, tally: rendered.tally, seconds }
             });
-            let answer = answer.await.map_err(WorkerError::Gone)?;
-            Ok(answer.next.unwrap_or(Next::Nothing(wire::Nothing {})))
-        }
+            // Nobody listens when the worker has ended.
+            let _ = send.blocking_send((task, delivery));
+        });
     }
-
-    fn renew(
-        &self,
-        leases: Vec<LeaseName>,
-    ) -> impl Future<Output = Result<Vec<LeaseName>, WorkerError>> + use<> {
-        let (client, patience) = (self.client.clone(), self.config.patience);
-        let leases = leases.into_iter().map(Into::into).collect();
-        let request = wire::RenewRequest { worker: self.worker.0, leases };
-        async move {
-            let answer = call(patience, DEADLINE, || {
-                let (mut client, request) = (client.clone(), request.clone());
-                async move { client.renew(request).await }
-            });
-            let answer = answer.await.map_err(WorkerError::Gone)?;
-            Ok(answer.lost.into_iter().map(Into::into).collect())
-        }
-    }
-
-    /// Brings a tile. Its pixels are kept until the coordinator has answered.
-    fn deliver(
-        &self,
-        delivery: wire::DeliverRequest,
-    ) -> impl Future<Output = Result<(), WorkerError>> + use<> {
-        let (client, patience) = (self.client.clone(), self.config.patience);
-        async move {
-            let answer = call(patience, DEADLINE * 2, || {
-                let (mut client, delivery) = (client.clone(), delivery.clone());
-                async move { client.deliver(delivery).await }
-            });
-            let answer = answer.await.map_err(WorkerError::Gone)?;
-            tracing::debug!(tile = delivery.tile, verdict = ?answer.verdict(), "delivered");
-            Ok(())
-        }
-    }
-
-    /// Gives every lease back, if the coordinator can still be told.
-    async fn leave(&self, reason: &str) {
-        let mut client = self.client.clone();
-        let request = wire::LeaveRequest { worker: self.worker.0, reason: reason.to_owned() };
-        let _ = tokio::time::timeout(Duration::from_secs(1), client.leave(request)).await;
-    }
-}
-
-/// The longest run that is asked for, in tiles a thread.
-const LONGEST_RUN_A_THREAD: usize = 32;
-
-fn read_run(run: wire::Run) -> Result<Run, SceneError> {
-    use rtfarm_proto::WireError::Missing;
-
-    let lease = run.lease.ok_or(Missing("lease"))?.into();
-    let job: Description = run.job.ok_or(Missing("job"))?.try_into()?;
-    let tiles = run.tiles.iter().map(|&number| job.grid.tile(number).ok_or(Missing("tile")));
-    let tiles = tiles.collect::<Result<_, _>>()?;
-    Ok(Run { lease, tiles, job })
 }

@@ -1,106 +1,112 @@
-//! A binary tree over all emitters, to choose one of many by what it promises a receiver.
+//! A receiver chooses one of many emitters through a binary tree over all of them, by importance.
 //!
 //! Source: Conty & Kulla, "Importance Sampling of Many Lights with Adaptive Tree Splitting"
-//! (2018). Here the nearest few nodes are opened at every receiver, which also tells how far
-//! emitters fill its sky; below them one path is walked at random.
+//! (2018). Here the tree's most important few nodes are opened at every receiver, which also tells
+//! how far emitters fill its hemisphere; below them one path is walked at random.
 
-use glam::DVec3;
-
-use super::sampling::{FULL_SHARE, Promise, Receiver, promise, sphere_share};
+use super::importance::{Importance, Receiver, emitter_importance, node_importance};
 use crate::prepared::{
     layout::View,
     record::{EmitterNode, NO_NODE},
 };
 
-/// Nodes that are compared at a receiver before the walk.
-const OPENED: usize = 8;
+/// The most nodes of a cut.
+const MOST_NODES: usize = 8;
 
-/// The most promising nodes for a receiver: together they hold every emitter that promises
-/// anything.
-pub(crate) struct Survey {
-    nodes: [u32; OPENED],
-    /// The light of each.
-    lights: [f64; OPENED],
+/// A cut through the tree for one receiver: its nodes hold every emitter of importance exactly
+/// once. The name is from Walter et al., "Lightcuts" (2005).
+pub(super) struct LightCut {
+    nodes: [u32; MOST_NODES],
+    /// The irradiance from each node, above 0.
+    irradiances: [f64; MOST_NODES],
     count: usize,
-    total: Promise,
+    total: Importance,
 }
 
-impl Survey {
-    pub(crate) fn new(view: &View<'_>, receiver: &Receiver) -> Self {
-        let mut survey =
-            Self { nodes: [0; OPENED], lights: [0.0; OPENED], count: 0, total: Promise::default() };
-        if view.emitters.len() <= OPENED {
+impl LightCut {
+    /// Cuts the tree for a receiver: from the root on, the most important node is opened until
+    /// there are [`MOST_NODES`]. Where there are no more emitters than that, each is a node.
+    pub(super) fn new(view: &View<'_>, receiver: &Receiver) -> Self {
+        let mut cut = Self {
+            nodes: [0; MOST_NODES],
+            irradiances: [0.0; MOST_NODES],
+            count: 0,
+            total: Importance::default(),
+        };
+        if view.emitters.len() <= MOST_NODES {
             for record in view.emitters {
                 let emitter = &view.emitters[record.by_size as usize];
-                survey.take(emitter.node, &promise(view, emitter, receiver));
+                cut.add(emitter.node, &emitter_importance(view, emitter, receiver));
                 // Where emitters are all around, the largest tell so soon.
-                if survey.total.share >= FULL_SHARE {
-                    break; // Nothing will be aimed at.
+                if cut.total.fills_hemisphere() {
+                    break; // No emitter will be sampled.
                 }
             }
-            return survey;
+            return cut;
         }
-        // Nodes whose children may take their place, and what they promise.
-        let mut open = [(0, Promise::default()); OPENED];
+        // Nodes whose children may take their place, and their importance.
+        let mut open = [(0, Importance::default()); MOST_NODES];
         let mut count = 1;
-        open[0] = (0, node_promise(view, receiver, 0));
-        while count < OPENED {
+        open[0] = (0, node_importance(view, receiver, 0));
+        while count < MOST_NODES {
             let is_inner = |&k: &usize| !view.emitter_nodes[open[k].0 as usize].is_leaf();
-            let light = |k: usize| open[k].1.light;
+            let irradiance = |k: usize| open[k].1.irradiance;
             let inner = (0..count).filter(is_inner);
-            let Some(widest) = inner.reduce(|a, b| if light(b) > light(a) { b } else { a }) else {
+            let Some(brightest) =
+                inner.reduce(|a, b| if irradiance(b) > irradiance(a) { b } else { a })
+            else {
                 break;
             };
-            let first = view.emitter_nodes[open[widest].0 as usize].child;
-            open[widest] = (first, node_promise(view, receiver, first));
-            open[count] = (first + 1, node_promise(view, receiver, first + 1));
+            let first = view.emitter_nodes[open[brightest].0 as usize].child;
+            open[brightest] = (first, node_importance(view, receiver, first));
+            open[count] = (first + 1, node_importance(view, receiver, first + 1));
             count += 1;
         }
-        for (node, promise) in &open[..count] {
-            survey.take(*node, promise);
+        for (node, importance) in &open[..count] {
+            cut.add(*node, importance);
         }
-        survey
+        cut
     }
 
-    fn take(&mut self, node: u32, promise: &Promise) {
-        self.total.share += promise.share;
-        self.total.square += promise.square;
-        if promise.light > 0.0 {
+    fn add(&mut self, node: u32, importance: &Importance) {
+        self.total.form_factor += importance.form_factor;
+        self.total.mean_square += importance.mean_square;
+        if importance.irradiance > 0.0 {
             self.nodes[self.count] = node;
-            self.lights[self.count] = promise.light;
+            self.irradiances[self.count] = importance.irradiance;
             self.count += 1;
-            self.total.light += promise.light;
+            self.total.irradiance += importance.irradiance;
         }
     }
 
-    /// What all together promise; the share may be above 1.
-    pub(crate) fn total(&self) -> &Promise {
+    /// The importance of all emitters together; their form factor may be above 1.
+    pub(super) fn total(&self) -> &Importance {
         &self.total
     }
 
-    /// Chooses an emitter by a number in 0..1; with which probability. `None` where the walk ends
-    /// at a node whose children promise nothing.
-    pub(crate) fn choose(
+    /// Chooses an emitter by a number in 0..1 and tells with which probability, above 0 and up to
+    /// 1, it does so. It is `None` where the walk ends at a node whose children have no importance.
+    pub(super) fn choose(
         &self,
         view: &View<'_>,
         receiver: &Receiver,
         number: f64,
     ) -> Option<(u32, f64)> {
-        let total = self.total.light;
+        let total = self.total.irradiance;
         let mut left = number * total;
         let mut chosen = 0;
-        while chosen + 1 < self.count && left >= self.lights[chosen] {
-            left -= self.lights[chosen];
+        while chosen + 1 < self.count && left >= self.irradiances[chosen] {
+            left -= self.irradiances[chosen];
             chosen += 1;
         }
-        let light = *self.lights[..self.count].get(chosen)?;
-        let mut probability = light / total;
-        let mut number = (left / light).min(1.0);
+        let irradiance = *self.irradiances[..self.count].get(chosen)?;
+        let mut probability = irradiance / total;
+        let mut number = (left / irradiance).min(1.0);
         let mut node = &view.emitter_nodes[self.nodes[chosen] as usize];
         while !node.is_leaf() {
-            let [a, b] = children_light(view, receiver, node);
+            let [a, b] = child_irradiances(view, receiver, node);
             let share = a / (a + b);
-            // Also where both are 0.
+            // This is so also where both are 0.
             if share.is_nan() {
                 return None;
             }
@@ -118,20 +124,20 @@ impl Survey {
         (probability > 0.0).then_some((node.emitter, probability))
     }
 
-    /// The probability with which [`Survey::choose`] chooses an emitter.
-    pub(crate) fn probability(&self, view: &View<'_>, receiver: &Receiver, emitter: u32) -> f64 {
+    /// The probability, 0..=1, with which [`LightCut::choose`] chooses an emitter.
+    pub(super) fn probability(&self, view: &View<'_>, receiver: &Receiver, emitter: u32) -> f64 {
         let mut at = view.emitters[emitter as usize].node;
         let mut probability = 1.0;
         loop {
             if let Some(k) = self.nodes[..self.count].iter().position(|&node| node == at) {
-                return probability * (self.lights[k] / self.total.light);
+                return probability * (self.irradiances[k] / self.total.irradiance);
             }
             let parent = view.emitter_nodes[at as usize].parent;
             if parent == NO_NODE {
-                return 0.0; // It promises nothing.
+                return 0.0; // It has no importance.
             }
             let node = &view.emitter_nodes[parent as usize];
-            let [a, b] = children_light(view, receiver, node);
+            let [a, b] = child_irradiances(view, receiver, node);
             let share = a / (a + b);
             let share = if at == node.child { share } else { 1.0 - share };
             if share.is_nan() || share <= 0.0 {
@@ -143,23 +149,7 @@ impl Survey {
     }
 }
 
-fn children_light(view: &View<'_>, receiver: &Receiver, node: &EmitterNode) -> [f64; 2] {
-    [node.child, node.child + 1].map(|child| node_promise(view, receiver, child).light)
-}
-
-/// What all emitters of a node promise: that of a ball around them that they fill in part.
-fn node_promise(view: &View<'_>, receiver: &Receiver, index: u32) -> Promise {
-    let node = &view.emitter_nodes[index as usize];
-    if node.is_leaf() {
-        return promise(view, &view.emitters[node.emitter as usize], receiver);
-    }
-    let to_center = DVec3::from_array(node.center) - receiver.position;
-    let distance = to_center.length();
-    let whole = if distance > node.radius {
-        sphere_share(receiver.normal.dot(to_center) / distance, node.radius / distance)
-    } else {
-        1.0
-    };
-    let share = whole * node.fill;
-    Promise { share, light: share * node.radiosity, square: 0.0 }
+/// The irradiance from each of an inner node's two children.
+fn child_irradiances(view: &View<'_>, receiver: &Receiver, node: &EmitterNode) -> [f64; 2] {
+    [node.child, node.child + 1].map(|child| node_importance(view, receiver, child).irradiance)
 }

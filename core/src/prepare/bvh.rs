@@ -279,8 +279,10 @@ fn build_node(range: BuildRange<'_>, level: usize) -> Vec<Node> {
 
 #[cfg(test)]
 mod tests {
+    use rtfarm_oracle::hard_case::HardCase;
+
     use super::*;
-    use crate::{long::tell, prepared::node::MOST_LEVELS};
+    use crate::prepared::node::MOST_LEVELS;
 
     fn check(boxes: &[([f32; 3], [f32; 3])]) -> Vec<Node> {
         let mut primitives: Vec<BuildPrimitive> = boxes
@@ -341,8 +343,7 @@ mod tests {
     #[test]
     fn coincident_faces_are_halved_not_split_for_ever() {
         let nodes = check(&vec![([0.5; 3], [0.5; 3]); 100_000]);
-        tell(
-            29,
+        HardCase::EqualCentroids.tell(
             "boxes with one middle end in leaves",
             format!("{} nodes for 100 000", nodes.len()),
         );
@@ -357,7 +358,7 @@ mod tests {
             .collect();
         let nodes = check(&boxes);
         let measured = format!("{} nodes for 1000", nodes.len());
-        tell(30, "middles one ulp apart end in leaves", measured);
+        HardCase::CentroidsOneUlpApart.tell("middles one ulp apart end in leaves", measured);
     }
 
     type Splitter = fn(&BuildRange<'_>) -> Option<(usize, usize, f32)>;
@@ -426,8 +427,7 @@ mod tests {
             cost(range, splitter, area)
         };
         let (binned, swept) = (cost_of(None), cost_of(Some(swept_split as Splitter)));
-        tell(
-            31,
+        HardCase::TeapotInStadium.tell(
             "a teapot in a stadium a million times its size costs as with a full sweep",
             format!("{:.3} times {swept:.1}", binned / swept),
         );

@@ -1,6 +1,6 @@
 //! What a picture depends on besides the scene.
 
-use std::ops::RangeInclusive;
+use std::{fmt, ops::RangeInclusive};
 
 use crate::{
     sample::{FEWEST_FOR_ERROR, MOST_SAMPLES},
@@ -28,18 +28,19 @@ pub struct Quality {
     /// Surfaces that mirror light others.
     pub secondary: bool,
     /// A mirrored or transmitted branch whose weight in its sample is below this is not traced:
-    /// it counts as background. 0..=1.
-    pub cutoff: f64,
+    /// it counts as background.
+    pub cutoff: Cutoff,
 }
 
 impl Default for Quality {
     fn default() -> Self {
+        let (error, most) = (StandardError::EIGHT_BIT_STEP, SampleLimit::DEFAULT);
         Self {
-            sampling: Sampling::Adaptive { error: DEFAULT_ERROR, most: DEFAULT_MOST_SAMPLES },
+            sampling: Sampling::Adaptive { error, most },
             seed: 0,
             flat: false,
             secondary: true,
-            cutoff: DEFAULT_CUTOFF,
+            cutoff: Cutoff::DEFAULT,
         }
     }
 }
@@ -47,35 +48,137 @@ impl Default for Quality {
 /// How many samples pixels get.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Sampling {
-    /// The same number everywhere, one of [`Sampling::COUNTS`].
-    Fixed(u32),
+    /// The same number everywhere.
+    Fixed(SampleCount),
     /// As many as a pixel needs.
     Adaptive {
-        /// A pixel is sampled until its standard error is below this in each channel. 0..=1, not 0.
-        error: f64,
-        /// But at most so often, one of [`Sampling::MOST_COUNTS`].
-        most: u32,
+        /// A pixel is sampled until its standard error is below this in each channel.
+        error: StandardError,
+        /// No pixel gets more samples than this.
+        most: SampleLimit,
     },
 }
 
 impl Sampling {
-    /// How many samples a pixel may be given.
-    pub const COUNTS: RangeInclusive<u32> = 1..=MOST_SAMPLES;
+    /// `count` samples in every pixel; `None` for a number outside [`SampleCount::RANGE`].
+    pub fn fixed(count: u32) -> Option<Self> {
+        SampleCount::new(count).map(Self::Fixed)
+    }
 
-    /// The least upper limit is what an error can be estimated from.
-    pub const MOST_COUNTS: RangeInclusive<u32> = FEWEST_FOR_ERROR..=MOST_SAMPLES;
-
-    /// Whether a standard error can be asked for: above 0, at most 1.
-    pub fn is_error(error: f64) -> bool {
-        error > 0.0 && error <= 1.0
+    /// Samples until the standard error is below `error`, at most `most`; `None` where
+    /// [`StandardError::new`] or [`SampleLimit::new`] gives none.
+    pub fn adaptive(error: f64, most: u32) -> Option<Self> {
+        Some(Self::Adaptive { error: StandardError::new(error)?, most: SampleLimit::new(most)? })
     }
 }
 
-/// The standard error of a pixel where nobody chose one: an 8-bit step.
-pub const DEFAULT_ERROR: f64 = 1.0 / 255.0;
+/// A number of samples in a pixel: one of [`SampleCount::RANGE`].
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub struct SampleCount(u32);
 
-/// The most samples of a pixel where nobody chose their number.
-pub const DEFAULT_MOST_SAMPLES: u32 = 256;
+impl SampleCount {
+    /// How many samples a pixel may have.
+    pub const RANGE: RangeInclusive<u32> = 1..=MOST_SAMPLES;
 
-/// The cut-off where nobody chose one: a sixteenth of an 8-bit step.
-pub const DEFAULT_CUTOFF: f64 = 1.0 / 4096.0;
+    /// `None` for a number outside [`SampleCount::RANGE`].
+    pub fn new(count: u32) -> Option<Self> {
+        Self::RANGE.contains(&count).then_some(Self(count))
+    }
+
+    /// The number.
+    pub fn get(self) -> u32 {
+        self.0
+    }
+}
+
+impl fmt::Display for SampleCount {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        fmt::Display::fmt(&self.0, f)
+    }
+}
+
+/// The most samples that a pixel may get while its error is estimated: one of
+/// [`SampleLimit::RANGE`].
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub struct SampleLimit(u32);
+
+impl SampleLimit {
+    /// No error can be estimated from fewer samples than the least of these.
+    pub const RANGE: RangeInclusive<u32> = FEWEST_FOR_ERROR..=MOST_SAMPLES;
+
+    /// The limit where nobody chose one.
+    pub const DEFAULT: Self = Self(256);
+
+    /// `None` for a number outside [`SampleLimit::RANGE`].
+    pub fn new(count: u32) -> Option<Self> {
+        Self::RANGE.contains(&count).then_some(Self(count))
+    }
+
+    /// The number.
+    pub fn get(self) -> u32 {
+        self.0
+    }
+}
+
+impl fmt::Display for SampleLimit {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        fmt::Display::fmt(&self.0, f)
+    }
+}
+
+/// A standard error that a pixel's channels shall not exceed, where 1 is full light: above 0, at
+/// most 1.
+#[derive(Debug, Clone, Copy, PartialEq, PartialOrd)]
+pub struct StandardError(f64);
+
+impl StandardError {
+    /// The error where nobody chose one: a step of 8 bits.
+    pub const EIGHT_BIT_STEP: Self = Self(1.0 / 255.0);
+
+    /// `None` for a number that is not above 0 and at most 1.
+    pub fn new(error: f64) -> Option<Self> {
+        (error > 0.0 && error <= 1.0).then_some(Self(error))
+    }
+
+    /// The number.
+    pub fn get(self) -> f64 {
+        self.0
+    }
+}
+
+impl fmt::LowerExp for StandardError {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        fmt::LowerExp::fmt(&self.0, f)
+    }
+}
+
+impl fmt::Display for StandardError {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        fmt::Display::fmt(&self.0, f)
+    }
+}
+
+/// The weight in its sample from which on a branch is traced: 0..=1.
+#[derive(Debug, Clone, Copy, PartialEq, PartialOrd)]
+pub struct Cutoff(f64);
+
+impl Cutoff {
+    /// The cut-off where nobody chose one: a sixteenth of an 8-bit step.
+    pub const DEFAULT: Self = Self(1.0 / 4096.0);
+
+    /// `None` for a number outside 0..=1.
+    pub fn new(weight: f64) -> Option<Self> {
+        (0.0..=1.0).contains(&weight).then_some(Self(weight))
+    }
+
+    /// The weight.
+    pub fn get(self) -> f64 {
+        self.0
+    }
+}
+
+impl fmt::Display for Cutoff {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        fmt::Display::fmt(&self.0, f)
+    }
+}

@@ -1,5 +1,6 @@
-//! Rays in batches, class by class: a batch's camera rays are traced together, then the shadow rays
-//! towards each light in turn, then all mirrored and transmitted rays of the next depth, and so on.
+//! Rays class by class: the camera rays of a batch of samples are traced together, then the shadow
+//! rays towards each light in turn, then all mirrored and transmitted rays of the next depth, and
+//! so on.
 //!
 //! What a sample receives is added in one order of depths and lights, so it is the same to the bit
 //! whatever else is in the batch.
@@ -8,7 +9,7 @@ use std::ops::ControlFlow;
 
 use glam::DVec3;
 
-use super::settings::{Quality, Settings};
+use super::settings::Quality;
 use crate::{
     isa::Isa,
     left_out,
@@ -17,9 +18,10 @@ use crate::{
     sample::{Sample, node_after},
     shade::{
         optics::{mirror, refract},
-        point::{Point, surface_color},
-        ray_differential::Spread,
+        point::{Interaction, Point},
+        ray_differential::RayDifferential,
     },
+    tile::Size,
     trace::{
         batch::{trace, trace_shadows},
         ray::{Hit, Ray},
@@ -27,47 +29,52 @@ use crate::{
 };
 
 /// The depth of the last rays that are traced; camera rays have depth 0.
-pub(crate) const DEEPEST: u32 = 64;
+const DEEPEST: u32 = 64;
 
 /// A camera ray that is wanted.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct CameraSample {
+pub(super) struct CameraSample {
     /// The pixel's column.
-    pub(crate) x: u32,
+    pub(super) x: u32,
     /// The pixel's row.
-    pub(crate) y: u32,
+    pub(super) y: u32,
     /// Its random numbers.
-    pub(crate) sample: Sample,
-    /// The width of the square that it stands for, in pixels.
-    pub(crate) spread: f64,
+    pub(super) sample: Sample,
+    /// The side of the square that it stands for, in pixels.
+    pub(super) width: f64,
 }
 
 /// Samples on their way, and the queues that they pass through.
 #[derive(Debug, Default)]
-pub(crate) struct Batch {
-    /// The random numbers of each sample; empty where nothing gathers.
+pub(super) struct Wavefront {
+    /// The random numbers of each sample; empty where no light is gathered.
     samples: Vec<Sample>,
-    /// The rays of the current depth, and what each adds to.
-    rays: Vec<Ray>,
-    branches: Vec<Branch>,
-    /// What each ray's sample is wide; empty in a scene without textures.
-    spreads: Vec<Spread>,
+    /// The rays of the current depth, and those of the next.
+    queue: RayQueue,
+    next_queue: RayQueue,
     hits: Vec<Hit>,
     points: Vec<Point>,
     shadow_rays: Vec<Ray>,
     /// For each shadow ray, its point and what arrives if nothing is in its way.
     arrivals: Vec<(usize, DVec3)>,
+    /// For each shadow ray, the share of its light that arrives.
     shares: Vec<f64>,
-    next_rays: Vec<Ray>,
-    next_branches: Vec<Branch>,
     gatherer: Gatherer,
-    next_spreads: Vec<Spread>,
     /// What each camera ray met.
-    pub(crate) first_hits: Vec<Hit>,
+    first_hits: Vec<Hit>,
     /// What each sample sees.
-    pub(crate) colors: Vec<DVec3>,
-    /// Of each sample, the weights of the branches that were not traced.
-    pub(crate) cut: Vec<f64>,
+    colors: Vec<DVec3>,
+    /// For each sample, the weight of its branches that were not traced.
+    untraced: Vec<f64>,
+}
+
+/// Rays that wait to be traced, and what travels with each.
+#[derive(Debug, Default)]
+struct RayQueue {
+    rays: Vec<Ray>,
+    branches: Vec<Branch>,
+    /// Empty in a scene without textures.
+    differentials: Vec<RayDifferential>,
 }
 
 /// A ray of the tree that a camera ray grows into.
@@ -78,60 +85,92 @@ struct Branch {
     weight: f64,
     /// Tells the sample's branches apart; 0 for the camera ray.
     node: u64,
+    /// How many mirrors and faces lie behind it.
+    depth: u32,
 }
 
-impl Batch {
+impl RayQueue {
+    fn clear(&mut self) {
+        self.rays.clear();
+        self.branches.clear();
+        self.differentials.clear();
+    }
+
+    #[inline(always)]
+    fn push(&mut self, ray: Ray, branch: Branch, differential: Option<RayDifferential>) {
+        self.rays.push(ray);
+        self.branches.push(branch);
+        self.differentials.extend(differential);
+    }
+}
+
+impl Wavefront {
+    /// What each camera ray met, in the order of the samples.
+    pub(super) fn first_hits(&self) -> &[Hit] {
+        &self.first_hits
+    }
+
+    /// What each sample sees.
+    pub(super) fn colors(&self) -> &[DVec3] {
+        &self.colors
+    }
+
+    /// The largest weight of branches that were not traced, in any sample: 0..=1.
+    pub(super) fn most_untraced(&self) -> f64 {
+        self.untraced.iter().copied().fold(0.0, f64::max)
+    }
+
     /// Queues the camera rays of `samples`.
-    pub(crate) fn start(
+    pub(super) fn start(
         &mut self,
         view: &View<'_>,
-        settings: &Settings,
+        quality: &Quality,
+        frame: Size,
         samples: impl Iterator<Item = CameraSample>,
     ) {
-        let (size, camera) = (settings.size, &view.header.camera);
-        let gathers = gathers(view, &settings.quality);
+        let camera = &view.header.camera;
+        let gathers = gathers(view, quality);
         let has_textures = view.header.features.has_textures();
         let screen = [camera.top_left, camera.right, camera.down].map(DVec3::from_array);
-        self.rays.clear();
+        self.queue.clear();
         self.samples.clear();
-        self.spreads.clear();
-        self.rays.extend(samples.map(|CameraSample { x, y, sample, spread }| {
+        for (number, CameraSample { x, y, sample, width }) in samples.enumerate() {
             if gathers {
                 self.samples.push(sample);
             }
             let [across, down] = sample.position();
-            let u = (f64::from(x) + across) / f64::from(size.width());
-            let v = (f64::from(y) + down) / f64::from(size.height());
+            let u = (f64::from(x) + across) / f64::from(frame.width());
+            let v = (f64::from(y) + down) / f64::from(frame.height());
             let direction = screen[0] + u * screen[1] + v * screen[2];
-            if has_textures {
-                let steps = [(1, size.width()), (2, size.height())]
-                    .map(|(side, count)| screen[side] * (spread / f64::from(count)));
-                self.spreads.push(Spread::of_camera(direction, steps));
-            }
-            Ray {
+            let differential = has_textures.then(|| {
+                let steps = [(1, frame.width()), (2, frame.height())]
+                    .map(|(side, count)| screen[side] * (width / f64::from(count)));
+                RayDifferential::of_camera(direction, steps)
+            });
+            let ray = Ray {
                 origin: DVec3::from_array(camera.eye),
                 direction: direction / direction.length(),
                 reach: f64::INFINITY,
                 leaving: Surface::NONE,
                 after: Ray::NOTHING_AHEAD,
-            }
-        }));
-        self.branches.clear();
-        self.branches.extend((0..self.rays.len()).map(|sample| Branch {
-            sample,
-            weight: 1.0,
-            node: 0,
-        }));
+            };
+            self.queue.push(
+                ray,
+                Branch { sample: number, weight: 1.0, node: 0, depth: 0 },
+                differential,
+            );
+        }
+        let count = self.queue.rays.len();
         self.colors.clear();
-        self.colors.resize(self.rays.len(), DVec3::ZERO);
-        self.cut.clear();
-        self.cut.resize(self.rays.len(), 0.0);
+        self.colors.resize(count, DVec3::ZERO);
+        self.untraced.clear();
+        self.untraced.resize(count, 0.0);
     }
 
     /// Finds what every queued sample sees; how many rays that took. What is seen at one depth is
     /// added before what is seen at the next, and there a mirror's before the light behind it, so
     /// a sample's sum has one order whatever else is in the batch.
-    pub(crate) fn run(
+    pub(super) fn run(
         &mut self,
         view: &View<'_>,
         quality: &Quality,
@@ -140,31 +179,15 @@ impl Batch {
     ) -> ControlFlow<(), u64> {
         let background = DVec3::from_array(view.header.lighting.background);
         let mut ray_count = 0;
-        let has_textures = view.header.features.has_textures();
-        let mut depth = 0;
-        while !self.rays.is_empty() {
+        let mut is_first = true;
+        while !self.queue.rays.is_empty() {
             on_progress()?;
-            trace(view, isa, &self.rays, &mut self.hits);
-            if depth == 0 {
+            trace(view, isa, &self.queue.rays, &mut self.hits);
+            if std::mem::take(&mut is_first) {
                 self.first_hits.clone_from(&self.hits);
             }
-            ray_count += self.rays.len() as u64;
-            self.points.clear();
-            self.next_rays.clear();
-            self.next_branches.clear();
-            self.next_spreads.clear();
-            for index in 0..self.rays.len() {
-                let branch = self.branches[index];
-                if self.hits[index].is_some() {
-                    if has_textures {
-                        self.meet::<true>(view, index, quality.cutoff, depth);
-                    } else {
-                        self.meet::<false>(view, index, quality.cutoff, depth);
-                    }
-                } else {
-                    self.colors[branch.sample] += branch.weight * background;
-                }
-            }
+            ray_count += self.queue.rays.len() as u64;
+            self.meet_all(view, quality.cutoff.get());
             ray_count += self.light_points(view, quality.flat, isa);
             if gathers(view, quality) {
                 ray_count += self.gather(view, isa);
@@ -172,95 +195,130 @@ impl Batch {
             for point in &self.points {
                 self.colors[point.sample] += point.weight * (point.color * point.light);
             }
-            std::mem::swap(&mut self.rays, &mut self.next_rays);
-            std::mem::swap(&mut self.branches, &mut self.next_branches);
-            std::mem::swap(&mut self.spreads, &mut self.next_spreads);
-            depth += 1;
+            std::mem::swap(&mut self.queue, &mut self.next_queue);
         }
-        for (color, cut) in self.colors.iter_mut().zip(&self.cut) {
-            *color += *cut * background;
+        for (color, untraced) in self.colors.iter_mut().zip(&self.untraced) {
+            *color += *untraced * background;
         }
         ControlFlow::Continue(ray_count)
     }
 
-    /// Ray `index` has met a face: queues what its own light and its branches need.
-    fn meet<const HAS_TEXTURES: bool>(
+    /// Takes in what the queue's rays have met: fills the points and the next queue.
+    fn meet_all(&mut self, view: &View<'_>, cutoff: f64) {
+        let background = DVec3::from_array(view.header.lighting.background);
+        let has_textures = view.header.features.has_textures();
+        self.points.clear();
+        self.next_queue.clear();
+        for index in 0..self.queue.rays.len() {
+            if !self.hits[index].is_some() {
+                let branch = &self.queue.branches[index];
+                self.colors[branch.sample] += branch.weight * background;
+            } else if has_textures {
+                self.meet::<true>(view, index, cutoff);
+            } else {
+                self.meet::<false>(view, index, cutoff);
+            }
+        }
+    }
+
+    /// Ray `index` has met a face: finds the surface, shades it, and branches.
+    #[inline(always)]
+    fn meet<const HAS_TEXTURES: bool>(&mut self, view: &View<'_>, index: usize, cutoff: f64) {
+        let (ray, branch) = (self.queue.rays[index], self.queue.branches[index]);
+        let at = Interaction::new(view, &ray, &self.hits[index]);
+        let differential = HAS_TEXTURES
+            .then(|| self.queue.differentials[index].transfer(ray.direction, at.t, at.normal));
+        self.shade(view, &ray, branch, &at, differential);
+        if view.header.features.has_branches() {
+            self.branch(view, &ray, branch, &at, differential, cutoff);
+        }
+    }
+
+    /// Queues what the surface's own light needs.
+    #[inline(always)]
+    fn shade(
         &mut self,
         view: &View<'_>,
-        index: usize,
-        cutoff: f64,
-        depth: u32,
+        ray: &Ray,
+        branch: Branch,
+        at: &Interaction<'_>,
+        differential: Option<RayDifferential>,
     ) {
-        let (ray, hit) = (&self.rays[index], &self.hits[index]);
-        let Branch { sample, weight, node } = self.branches[index];
-        let position = ray.origin + hit.t * ray.direction;
-        let outward = hit.face.normal(view, position);
-        let is_front = outward.dot(ray.direction) <= 0.0;
-        let normal = if is_front { outward } else { -outward };
-        let surface = hit.face.surface(view);
-        let material = hit.face.material(view);
-        let (reflect, alpha) = (material.reflect, material.alpha);
-        let spread =
-            HAS_TEXTURES.then(|| self.spreads[index].transfer(ray.direction, hit.t, normal));
+        let (reflect, alpha) = (at.material.reflect, at.material.alpha);
         if reflect < 1.0 && alpha > 0.0 {
-            let patch = spread.map(|spread| spread.patch(ray.direction, normal));
+            let footprint =
+                differential.map(|differential| differential.footprint(ray.direction, at.normal));
             self.points.push(Point {
-                sample,
-                node,
-                weight: weight * ((1.0 - reflect) * alpha),
-                position,
-                normal,
-                surface,
-                color: surface_color(view, material, hit, (position, outward), patch),
+                sample: branch.sample,
+                node: branch.node,
+                weight: branch.weight * ((1.0 - reflect) * alpha),
+                position: at.position,
+                normal: at.normal,
+                surface: at.surface,
+                color: at.color(view, footprint),
                 light: view.header.lighting.ambient(),
             });
         }
-        if !view.header.features.has_branches() {
-            return;
-        }
-        let mut follow =
-            |direction: DVec3, after: u32, weight: f64, branch: u64, spread: Option<Spread>| {
-                if weight < cutoff || depth == DEEPEST {
-                    self.cut[sample] += weight;
-                    return;
-                }
-                self.next_rays.push(Ray {
-                    origin: position,
-                    direction,
-                    reach: f64::INFINITY,
-                    leaving: surface,
-                    after,
-                });
-                self.next_branches.push(Branch { sample, weight, node: node_after(node, branch) });
-                self.next_spreads.extend(spread);
-            };
-        let cosine = -normal.dot(ray.direction);
-        let mirrored = mirror(ray.direction, normal, cosine);
-        let curvature =
-            if spread.is_some() { hit.face.curvature(view, position, normal) } else { 0.0 };
-        let mirrored_spread = spread.map(|spread| spread.mirror(ray.direction, normal, curvature));
+    }
+
+    /// Queues the mirrored and the transmitted ray.
+    #[inline(always)]
+    fn branch(
+        &mut self,
+        view: &View<'_>,
+        ray: &Ray,
+        branch: Branch,
+        at: &Interaction<'_>,
+        differential: Option<RayDifferential>,
+        cutoff: f64,
+    ) {
+        let Branch { sample, weight, node, depth } = branch;
+        let (reflect, alpha, index) = (at.material.reflect, at.material.alpha, at.material.refract);
+        let mut follow = |direction: DVec3,
+                          after: u32,
+                          weight: f64,
+                          number: u64,
+                          differential: Option<RayDifferential>| {
+            if weight < cutoff || depth == DEEPEST {
+                self.untraced[sample] += weight;
+                return;
+            }
+            let (origin, leaving) = (at.position, at.surface);
+            let ray = Ray { origin, direction, reach: f64::INFINITY, leaving, after };
+            let node = node_after(node, number);
+            self.next_queue.push(
+                ray,
+                Branch { sample, weight, node, depth: depth + 1 },
+                differential,
+            );
+        };
+        let cosine = -at.normal.dot(ray.direction);
+        let mirrored = mirror(ray.direction, at.normal, cosine);
+        let curvature = if differential.is_some() { at.curvature(view) } else { 0.0 };
+        let mirrored_differential = differential
+            .map(|differential| differential.mirror(ray.direction, at.normal, curvature));
         if reflect > 0.0 && !left_out::MIRROR {
-            follow(mirrored, Ray::NOTHING_AHEAD, weight * reflect, 1, mirrored_spread);
+            follow(mirrored, Ray::NOTHING_AHEAD, weight * reflect, 1, mirrored_differential);
         }
         if reflect < 1.0 && alpha < 1.0 && !left_out::TRANSPARENCY {
             let weight = weight * ((1.0 - reflect) * (1.0 - alpha));
-            let ratio = if is_front { material.refract } else { 1.0 / material.refract };
-            let is_straight =
-                left_out::REFRACTION || material.refract == 0.0 || material.refract == 1.0;
+            let ratio = if at.is_front { index } else { 1.0 / index };
+            let is_straight = left_out::REFRACTION || index == 0.0 || index == 1.0;
             let bent = if is_straight {
                 Some(ray.direction)
             } else {
-                refract(ray.direction, normal, cosine, ratio)
+                refract(ray.direction, at.normal, cosine, ratio)
             };
             match bent {
                 Some(direction) => {
-                    let refract =
-                        |spread: Spread| spread.refract(ray.direction, normal, curvature, ratio);
-                    let bent = if is_straight { spread } else { spread.map(refract) };
-                    follow(direction, hit.rank, weight, 2, bent);
+                    let refract = |differential: RayDifferential| {
+                        differential.refract(ray.direction, at.normal, curvature, ratio)
+                    };
+                    let bent = if is_straight { differential } else { differential.map(refract) };
+                    follow(direction, at.rank, weight, 2, bent);
                 }
                 // Total reflection.
-                None => follow(mirrored, Ray::NOTHING_AHEAD, weight, 2, mirrored_spread),
+                None => follow(mirrored, Ray::NOTHING_AHEAD, weight, 2, mirrored_differential),
             }
         }
     }

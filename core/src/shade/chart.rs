@@ -1,4 +1,5 @@
-//! Where in its face a point of a triangle or a quadrangle lies, and where on an image.
+//! A chart tells where in its face a point of a triangle or a quadrangle lies; texture coordinates
+//! tell where that is on an image.
 
 use glam::{DVec2, DVec3};
 
@@ -7,13 +8,13 @@ use crate::{
     prepared::record::Texcoords,
 };
 
-/// A face over the unit square: corner + s · along + t · up + s · t · twist. A triangle is the half
-/// below s + t = 1 of a parallelogram.
+/// A face as the image of the unit square: corner + s · along + t · up + s · t · twist. A triangle is
+/// the half below s + t = 1 of a parallelogram.
 ///
 /// The face is seen along the axis that its normal is closest to, from the side that sees its
 /// corners counter-clockwise, in units near its own size.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Chart {
+pub(super) struct Chart {
     corner: DVec3,
     axes: [usize; 2],
     scale: f64,
@@ -24,8 +25,9 @@ pub(crate) struct Chart {
 }
 
 impl Chart {
-    /// Of three corners or four, counter-clockwise seen from where `normal` points.
-    pub(crate) fn new(corners: &[DVec3], normal: DVec3) -> Self {
+    /// Makes the chart of a face with three corners or four, counter-clockwise seen from where
+    /// `normal` points.
+    pub(super) fn new(corners: &[DVec3], normal: DVec3) -> Self {
         let from_first = |k: usize| corners[k] - corners[0];
         let extent =
             (1..corners.len()).map(|k| from_first(k).abs().max_element()).fold(0.0, f64::max);
@@ -52,14 +54,14 @@ impl Chart {
         DVec2::new(step[self.axes[0]], step[self.axes[1]]) * self.scale
     }
 
-    /// The place (s, t) of a point of the face, each in 0..=1.
+    /// Finds the place (s, t) of a point of the face, each in 0..=1.
     ///
     /// Each is the root of a quadratic, whose slope there is the map's determinant. Inside a simple
     /// quadrangle, convex or not, one place with a positive determinant is in the unit square, for
     /// the map goes round the outline once and has no more than two roots. So that root is taken,
     /// in the form that cancels nothing: there is no division by the twist, which is 0 in a
     /// parallelogram.
-    pub(crate) fn place(&self, point: DVec3) -> DVec2 {
+    pub(super) fn place(&self, point: DVec3) -> DVec2 {
         let from_corner = self.project(point - self.corner);
         let area = cross(self.along, self.up);
         let turned = cross(from_corner, self.twist);
@@ -73,8 +75,9 @@ impl Chart {
         DVec2::new(s, if t > 0.0 { t.min(most) } else { 0.0 })
     }
 
-    /// How a step along the face moves the place; not finite where the map folds.
-    pub(crate) fn step(&self, place: DVec2, step: DVec3) -> DVec2 {
+    /// Tells how a step along the face, in the block's units, moves the place. It is not finite where
+    /// the map folds.
+    pub(super) fn step(&self, place: DVec2, step: DVec3) -> DVec2 {
         let step = self.project(step);
         let along = self.along + place.y * self.twist;
         let up = self.up + place.x * self.twist;
@@ -82,13 +85,13 @@ impl Chart {
     }
 }
 
-/// The root of a · x² + b · x = c at which the left side rises.
+/// Solves a · x² + b · x = c for the x at which the left side rises.
 fn rising_root(a: f64, b: f64, c: f64) -> f64 {
     let slope = (b * b + 4.0 * a * c).max(0.0).sqrt();
     if b > 0.0 { 2.0 * c / (b + slope) } else { (slope - b) / (2.0 * a) }
 }
 
-/// a × b, right to an ulp or two.
+/// Computes a × b, right to an ulp or two.
 fn cross(a: DVec2, b: DVec2) -> f64 {
     let (left, left_error) = exact_product(a.x, b.y);
     let (right, right_error) = exact_product(a.y, b.x);
@@ -96,30 +99,33 @@ fn cross(a: DVec2, b: DVec2) -> f64 {
 }
 
 impl Texcoords {
-    /// Of a quadrangle, or of a triangle, whose corners are the first, the second and the last.
+    /// Those of a face that was given none. A triangle's corners are the first, the second and the
+    /// last.
     pub(crate) const DEFAULT: Self = Self([[0.0, 1.0], [1.0, 1.0], [1.0, 0.0], [0.0, 0.0]]);
 
     /// Beyond this a number has no fraction, so an image that repeats has no place there.
     const LARGEST: f64 = (1_u64 << 53) as f64;
 
+    /// Makes those of a quadrangle with these at its corners.
     pub(crate) fn of_quadrangle(corners: [DVec2; 4]) -> Self {
         let limit = DVec2::splat(Self::LARGEST);
         Self(corners.map(|corner| corner.clamp(-limit, limit).to_array()))
     }
 
+    /// Makes those of a triangle with these at its corners.
     pub(crate) fn of_triangle([a, b, c]: [DVec2; 3]) -> Self {
         Self::of_quadrangle([a, b, b + (c - a), c])
     }
 
     /// The texture coordinates at a place.
-    pub(crate) fn at(&self, place: DVec2) -> DVec2 {
+    pub(super) fn at(&self, place: DVec2) -> DVec2 {
         let [a, b, c, d] = self.0.map(DVec2::from_array);
         let (s, t) = (place.x, place.y);
         (a * (1.0 - s) + b * s) * (1.0 - t) + (d * (1.0 - s) + c * s) * t
     }
 
-    /// How a step from a place moves them.
-    pub(crate) fn step(&self, place: DVec2, step: DVec2) -> DVec2 {
+    /// Tells how a step from a place moves the texture coordinates there.
+    pub(super) fn step(&self, place: DVec2, step: DVec2) -> DVec2 {
         let [a, b, c, d] = self.0.map(DVec2::from_array);
         let (s, t) = (place.x, place.y);
         ((b - a) * (1.0 - t) + (c - d) * t) * step.x + ((d - a) * (1.0 - s) + (c - b) * s) * step.y
@@ -128,10 +134,12 @@ impl Texcoords {
 
 #[cfg(test)]
 mod tests {
-    use rtfarm_oracle::random::Random;
+    use rtfarm_oracle::{
+        hard_case::{HardCase, random, rays},
+        random::Random,
+    };
 
     use super::*;
-    use crate::long::{random, rays, tell};
 
     /// The point at a place, and how much of a rounding error there the place takes on.
     fn point(corners: &[DVec3; 4], place: DVec2) -> (DVec3, f64) {
@@ -207,13 +215,11 @@ mod tests {
             check_round_trips("a needle", needle, random);
         }
         let count = 6 * 100 * shapes;
-        tell(
-            39,
+        HardCase::TextureRoundTrip.tell(
             "texture coordinates survive the way to a quadrangle and back",
             format!("{count} places, off by {worst:.1e} at most"),
         );
-        tell(
-            40,
+        HardCase::TextureBorder.tell(
             "texture coordinates stay in the image, also on its border",
             format!("0 of {count} places outside, 36 % of them on the border"),
         );

@@ -1,16 +1,86 @@
-//! A place on a surface that a ray sees.
+//! What stands where a ray meets a face, and a place there that waits for its light.
 
 use glam::DVec3;
 
-use super::{ray_differential::Patch, texture::texture_color};
+use super::{ray_differential::SurfaceFootprint, texture::texture_color};
 use crate::{
     left_out,
     prepared::{
+        face::Face,
         layout::View,
         record::{MaterialRecord, Surface},
     },
-    trace::ray::Hit,
+    trace::ray::{Hit, Ray},
 };
+
+/// What stands where a ray has met a face.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Interaction<'a> {
+    /// The distance from the ray's origin, in units of its direction.
+    pub(crate) t: f64,
+    pub(crate) position: DVec3,
+    pub(crate) face: Face,
+    pub(crate) rank: u32,
+    pub(crate) surface: Surface,
+    pub(crate) material: &'a MaterialRecord,
+    /// The unit normal towards the face's front.
+    outward: DVec3,
+    /// The unit normal towards the side that the ray comes from.
+    pub(crate) normal: DVec3,
+    /// The ray comes from the face's front.
+    pub(crate) is_front: bool,
+}
+
+impl<'a> Interaction<'a> {
+    /// What stands at `hit`, which must be a hit of `ray`.
+    #[inline(always)]
+    pub(crate) fn new(view: &View<'a>, ray: &Ray, hit: &Hit) -> Self {
+        let Hit { t, face, rank } = *hit;
+        let position = ray.origin + t * ray.direction;
+        let outward = face.normal(view, position);
+        let is_front = outward.dot(ray.direction) <= 0.0;
+        Self {
+            t,
+            position,
+            face,
+            rank,
+            surface: face.surface(view),
+            material: face.material(view),
+            outward,
+            normal: if is_front { outward } else { -outward },
+            is_front,
+        }
+    }
+
+    /// The face's colour, its texture included, of which the sample sees `footprint`. There is none in
+    /// a scene without textures.
+    #[inline(always)]
+    pub(crate) fn color(&self, view: &View<'_>, footprint: Option<SurfaceFootprint>) -> DVec3 {
+        let color = DVec3::from_array(self.material.color);
+        match footprint {
+            Some(footprint)
+                if self.material.texture != MaterialRecord::PLAIN && !left_out::TEXTURE =>
+            {
+                let at = (self.position, self.outward);
+                color
+                    * texture_color(
+                        view,
+                        self.material.texture,
+                        self.face,
+                        self.rank,
+                        at,
+                        footprint,
+                    )
+            }
+            _ => color,
+        }
+    }
+
+    /// By how much a step along the face turns the normal, per unit of the step.
+    pub(crate) fn curvature(&self, view: &View<'_>) -> f64 {
+        self.face.curvature(view, self.position, self.normal)
+    }
+}
 
 /// A place on a surface that a ray sees.
 #[derive(Debug)]
@@ -27,23 +97,4 @@ pub(crate) struct Point {
     pub(crate) color: DVec3,
     /// The light received so far.
     pub(crate) light: DVec3,
-}
-
-/// The colour of a face at a hit, its texture included, of which the sample sees `patch`. There is
-/// none in a scene without textures.
-#[inline(always)]
-pub(crate) fn surface_color(
-    view: &View<'_>,
-    material: &MaterialRecord,
-    hit: &Hit,
-    at: (DVec3, DVec3),
-    patch: Option<Patch>,
-) -> DVec3 {
-    let color = DVec3::from_array(material.color);
-    match patch {
-        Some(patch) if material.texture != MaterialRecord::PLAIN && !left_out::TEXTURE => {
-            color * texture_color(view, material.texture, hit, at, patch)
-        }
-        _ => color,
-    }
 }

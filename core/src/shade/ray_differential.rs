@@ -1,35 +1,40 @@
-//! How far apart neighbouring samples' rays are, on their way through the scene.
+//! Ray differentials tell how far apart neighbouring samples' rays are, on their way through the
+//! scene.
 //!
 //! Source: Igehy, "Tracing Ray Differentials" (1999).
 
 use glam::DVec3;
 
-/// The derivatives of a ray by its sample's place, across and down the screen; a step of 1 is what
-/// belongs to one sample.
+/// The derivatives of a ray by its sample's place on the screen, first across and then down. A step
+/// of 1 is the width of the square that belongs to one sample.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Spread {
-    /// Of the ray's origin. After [`Spread::transfer`] they lie in the surface.
+pub(crate) struct RayDifferential {
+    /// The derivatives of the ray's origin, in the block's units. After
+    /// [`RayDifferential::transfer`] they lie in the surface.
     pub(crate) origin: [DVec3; 2],
-    /// Of the ray's direction, which has length 1.
+    /// The derivatives of the ray's unit direction.
     direction: [DVec3; 2],
 }
 
-/// The part of a flat face that belongs to a sample: what its rays at (s, t), each from -1/2 to
-/// 1/2, meet at the middle + (s · first side + t · second side) / (1 + s · first taper + t · second
+/// The part of a flat face that belongs to a sample. Its ray at (s, t), each in -1/2..=1/2, meets
+/// the face at the middle + (s · first side + t · second side) / (1 + s · first taper + t · second
 /// taper).
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Patch {
+pub(crate) struct SurfaceFootprint {
+    /// The sides, in the block's units.
     pub(crate) sides: [DVec3; 2],
+    /// The changes of the denominator by s and by t: they draw the far end out.
     pub(crate) tapers: [f64; 2],
 }
 
-impl Patch {
+impl SurfaceFootprint {
     /// A single point.
     pub(crate) const POINT: Self = Self { sides: [DVec3::ZERO; 2], tapers: [0.0; 2] };
 }
 
-impl Spread {
-    /// Of a camera ray towards `target` (seen from the eye), which a sample's `steps` move.
+impl RayDifferential {
+    /// Makes that of a camera ray towards `target`, relative to the eye, which a sample's `steps`
+    /// across and down the screen move.
     pub(crate) fn of_camera(target: DVec3, steps: [DVec3; 2]) -> Self {
         let length = target.length();
         let direction = target / length;
@@ -37,7 +42,8 @@ impl Spread {
         Self { origin: [DVec3::ZERO; 2], direction: steps.map(turn) }
     }
 
-    /// Where the ray has met a surface at the distance `t`. Not finite for a ray along it.
+    /// Moves it to where the ray along `direction` has met a surface at the distance `t`. It is not
+    /// finite for a ray along the surface.
     pub(crate) fn transfer(&self, direction: DVec3, t: f64, normal: DVec3) -> Self {
         let origin = [0, 1].map(|k| {
             let moved = self.origin[k] + t * self.direction[k];
@@ -46,21 +52,21 @@ impl Spread {
         Self { origin, ..*self }
     }
 
-    /// What the sample sees of a flat face: a ray along `direction` has just met it.
-    pub(crate) fn patch(&self, direction: DVec3, normal: DVec3) -> Patch {
+    /// The part that the sample sees of a flat face, which a ray along `direction` has just met.
+    pub(crate) fn footprint(&self, direction: DVec3, normal: DVec3) -> SurfaceFootprint {
         let tapers = self.direction.map(|step| step.dot(normal) / direction.dot(normal));
-        Patch { sides: self.origin, tapers }
+        SurfaceFootprint { sides: self.origin, tapers }
     }
 
-    /// After a mirror: `direction` came in, towards the side of the unit `normal`; a step along the
+    /// Mirrors it: `direction` came in, towards the side of the unit `normal`, and a step along the
     /// surface turns the normal by `curvature` times the step.
     pub(crate) fn mirror(&self, direction: DVec3, normal: DVec3, curvature: f64) -> Self {
         let cosine = -direction.dot(normal);
         self.turn(direction, normal, curvature, [1.0, 2.0 * cosine, 2.0])
     }
 
-    /// After a refraction by n1/n2 = `ratio`; see [`Spread::mirror`]. Not finite at the critical
-    /// angle.
+    /// Refracts it by n1/n2 = `ratio`, above 0; see [`RayDifferential::mirror`]. It is not finite at
+    /// the critical angle.
     pub(crate) fn refract(
         &self,
         direction: DVec3,
@@ -69,24 +75,25 @@ impl Spread {
         ratio: f64,
     ) -> Self {
         let cosine = -direction.dot(normal);
-        let behind = (1.0 - ratio * ratio * ((1.0 - cosine) * (1.0 + cosine))).sqrt();
-        let slope = ratio - ratio * ratio * cosine / behind;
-        self.turn(direction, normal, curvature, [ratio, ratio * cosine - behind, slope])
+        let cosine_behind = (1.0 - ratio * ratio * ((1.0 - cosine) * (1.0 + cosine))).sqrt();
+        let slope = ratio - ratio * ratio * cosine / cosine_behind;
+        self.turn(direction, normal, curvature, [ratio, ratio * cosine - cosine_behind, slope])
     }
 
-    /// The new direction is `kept` times the old one and `share` times the normal; `slope` is the
-    /// share's derivative by the cosine between the normal and where the ray came from.
+    /// Turns the direction: the new one is `kept` times the old one and `added` times the normal.
+    /// `slope` is the derivative of `added` by the cosine between the normal and where the ray came
+    /// from.
     fn turn(
         &self,
         direction: DVec3,
         normal: DVec3,
         curvature: f64,
-        [kept, share, slope]: [f64; 3],
+        [kept, added, slope]: [f64; 3],
     ) -> Self {
         let directions = [0, 1].map(|k| {
             let normal_step = curvature * self.origin[k];
             let cosine_step = -(self.direction[k].dot(normal) + direction.dot(normal_step));
-            kept * self.direction[k] + share * normal_step + (slope * cosine_step) * normal
+            kept * self.direction[k] + added * normal_step + (slope * cosine_step) * normal
         });
         Self { direction: directions, ..*self }
     }
@@ -130,7 +137,7 @@ mod tests {
                 let eye = DVec3::new(0.3, -0.2, 4.0);
                 let direction = target.normalize();
                 let (normal, curvature) = if is_round { (point, 1.0) } else { (DVec3::Z, 0.0) };
-                let met = Spread::of_camera(target, [DVec3::X, DVec3::Y]).transfer(
+                let met = RayDifferential::of_camera(target, [DVec3::X, DVec3::Y]).transfer(
                     direction,
                     (point - eye).length(),
                     normal,
@@ -154,14 +161,14 @@ mod tests {
     }
 
     #[test]
-    fn a_patch_reaches_to_the_horizon_as_rays_do() {
+    fn a_footprint_reaches_to_the_horizon_as_rays_do() {
         // A floor one below the eye, seen from 2 to 3 hundredths below the horizon.
         let (normal, target) = (DVec3::Y, DVec3::new(0.3, -0.025, -1.0));
         let steps = [DVec3::X * 0.01, DVec3::Y * 0.01];
         let met = |target: DVec3| target / -target.y;
         let (direction, t) = (target.normalize(), met(target).length());
-        let spread = Spread::of_camera(target, steps).transfer(direction, t, normal);
-        let Patch { sides, tapers } = spread.patch(direction, normal);
+        let differential = RayDifferential::of_camera(target, steps).transfer(direction, t, normal);
+        let SurfaceFootprint { sides, tapers } = differential.footprint(direction, normal);
         for (s, t) in [(-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5), (0.0, 0.5), (0.2, -0.1)]
         {
             let truth = met(target + s * steps[0] + t * steps[1]) - met(target);

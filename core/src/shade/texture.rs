@@ -1,69 +1,73 @@
-//! What a sample sees of an image: its mean over the part that belongs to the sample.
+//! A sample sees of an image its mean over the part that belongs to the sample.
 
 use glam::{DVec2, DVec3};
 
-use super::{chart::Chart, ray_differential::Patch};
-use crate::{
-    prepared::{
-        layout::View,
-        record::{LevelRecord, TexturedFace},
-    },
-    trace::ray::Hit,
+use super::{chart::Chart, ray_differential::SurfaceFootprint};
+use crate::prepared::{
+    face::Face,
+    layout::View,
+    record::{LevelRecord, TexturedFace},
 };
 
-/// The most probes along a footprint's longer axis, and so how much longer than wide a footprint
-/// may be that is not blurred.
+/// The most probes along a footprint's longer axis. A footprint that is longer than this times its
+/// width is blurred.
 const MOST_PROBES: f64 = 32.0;
 
-/// How near the far end of a footprint is taken to be, of its middle, at the horizon.
+/// The least distance of a footprint's middle relative to that of its far end: one that reaches to
+/// the horizon ends there.
 const LEAST_NEARNESS: f64 = 1.0 / 64.0;
 
-/// A part of an image, in texture coordinates: see [`Patch`].
+/// The part of an image that belongs to a sample, in texture coordinates; see
+/// [`SurfaceFootprint`].
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Footprint {
-    pub(crate) center: DVec2,
-    pub(crate) sides: [DVec2; 2],
-    pub(crate) tapers: [f64; 2],
+pub(super) struct TextureFootprint {
+    center: DVec2,
+    sides: [DVec2; 2],
+    tapers: [f64; 2],
 }
 
-/// What multiplies the colour of a face at a hit: its texture, of which the sample sees `patch`.
-/// White where the face has no texture coordinates.
-pub(crate) fn texture_color(
+/// Finds what multiplies the colour of a face at a hit, in linear RGB: the mean of its texture over
+/// `footprint`, or white where the face has no texture coordinates.
+pub(super) fn texture_color(
     view: &View<'_>,
     texture: u32,
-    hit: &Hit,
+    face: Face,
+    rank: u32,
     (position, outward): (DVec3, DVec3),
-    patch: Patch,
+    footprint: SurfaceFootprint,
 ) -> DVec3 {
     let faces = view.textured_faces;
-    let Ok(face) = faces.binary_search_by_key(&hit.rank, |face| face.rank) else {
+    let Ok(index) = faces.binary_search_by_key(&rank, |face| face.rank) else {
         return DVec3::ONE;
     };
-    let TexturedFace { texcoords, .. } = faces[face];
-    let Some(polygon) = hit.face.polygon(view) else { return DVec3::ONE };
+    let TexturedFace { texcoords, .. } = faces[index];
+    let Some(polygon) = face.polygon(view) else { return DVec3::ONE };
     let chart = Chart::new(polygon.corners(), outward);
     let place = chart.place(position);
-    let footprint = Footprint {
+    let footprint = TextureFootprint {
         center: texcoords.at(place),
-        sides: patch.sides.map(|side| texcoords.step(place, chart.step(place, side))),
-        tapers: patch.tapers,
+        sides: footprint.sides.map(|side| texcoords.step(place, chart.step(place, side))),
+        tapers: footprint.tapers,
     };
     TextureView::new(view, texture).mean(&footprint)
 }
 
 /// A texture that can be looked at.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct TextureView<'a> {
-    pub(crate) levels: &'a [LevelRecord],
-    pub(crate) fine: &'a [[u8; 4]],
-    /// What their bytes stand for, in 255ths.
-    pub(crate) light_of_bytes: &'a [f64; 256],
-    pub(crate) coarse: &'a [[f32; 3]],
+pub(super) struct TextureView<'a> {
+    /// Its levels, the finest first, each half as large as the one before it.
+    levels: &'a [LevelRecord],
+    /// The texels of the finest levels of all images, encoded RGB and one byte unused.
+    fine: &'a [[u8; 4]],
+    /// What a byte of `fine` stands for, in 255ths.
+    light_of_bytes: &'a [f64; 256],
+    /// The texels of the coarser levels of all images, linear RGB.
+    coarse: &'a [[f32; 3]],
 }
 
 impl<'a> TextureView<'a> {
-    /// An image with its levels.
-    pub(crate) fn new(view: &View<'a>, index: u32) -> Self {
+    /// Looks at the image of an index.
+    pub(super) fn new(view: &View<'a>, index: u32) -> Self {
         Self {
             levels: &view.texture_levels[view.textures[index as usize].levels()],
             fine: view.fine_texels,
@@ -72,10 +76,10 @@ impl<'a> TextureView<'a> {
         }
     }
 
-    /// The mean over a footprint, nearly: probes along its longer axis, each as wide as its shorter
-    /// one is there. A footprint within a texel gives the image itself, bilinear between the middles
-    /// of texels.
-    pub(crate) fn mean(&self, footprint: &Footprint) -> DVec3 {
+    /// Estimates the mean over a footprint, in linear RGB, by probes along its longer axis, each as
+    /// wide as its shorter one is there. A footprint within a texel gives the image itself, bilinear
+    /// between the middles of texels.
+    pub(super) fn mean(&self, footprint: &TextureFootprint) -> DVec3 {
         // Source: McCormack, Perry, Farkas & Jouppi, "Feline: Fast Elliptical Lines for Anisotropic
         // Texture Mapping" (1999), but with the axes of the footprint's own ellipse, equal weights,
         // which fit a pixel's square, and probes at equal distances on the screen, not the image.
@@ -124,7 +128,8 @@ impl<'a> TextureView<'a> {
         DVec2::new(self.levels[0].width.into(), self.levels[0].height.into())
     }
 
-    /// Between the two levels whose texels are nearest to `width` (>= 1) of the finest ones.
+    /// Interpolates between the two levels whose texels are nearest to `width`, at least 1, of the
+    /// finest ones.
     fn trilinear(&self, width: f64, at: DVec2) -> DVec3 {
         // The logarithm to base 2, linear between powers of two: exponent and mantissa.
         let exponent = (width.to_bits() >> 52) as usize - 1023;
@@ -140,7 +145,7 @@ impl<'a> TextureView<'a> {
         finer + (mantissa - 1.0) * (self.bilinear(exponent + 1, at) - finer)
     }
 
-    /// Between the middles of four texels of a level, which repeats on all sides.
+    /// Interpolates between the middles of four texels of a level, which repeats on all sides.
     fn bilinear(&self, level: usize, at: DVec2) -> DVec3 {
         let LevelRecord { width, height, offset } = self.levels[level];
         let ([left, right], across) = neighbours(at.x, width);
@@ -155,7 +160,7 @@ impl<'a> TextureView<'a> {
         if level == 0 { color / 255.0 } else { color }
     }
 
-    /// Of the finest level in 255ths, which keeps sums exact.
+    /// Reads a texel: of the finest level in 255ths, which keeps sums exact, else as it is.
     fn texel(&self, level: usize, index: usize) -> DVec3 {
         if level == 0 {
             let [r, g, b, _] = self.fine[index];
@@ -167,7 +172,8 @@ impl<'a> TextureView<'a> {
     }
 }
 
-/// The two of `count` texels around a coordinate, and how far it is on the way to the second.
+/// Finds the two of `count` texels around a coordinate, and how far it is on the way from the first
+/// to the second, 0..=1.
 fn neighbours(coordinate: f64, count: u32) -> ([usize; 2], f64) {
     let fraction = coordinate - coordinate.floor();
     // Not NaN, nor the 1 that a tiny negative number rounds to.
@@ -208,8 +214,8 @@ mod tests {
         [bits >> 24, bits >> 16, bits >> 8].map(|channel| channel as u8)
     }
 
-    fn footprint(center: [f64; 2], sides: [[f64; 2]; 2]) -> Footprint {
-        Footprint {
+    fn footprint(center: [f64; 2], sides: [[f64; 2]; 2]) -> TextureFootprint {
+        TextureFootprint {
             center: DVec2::from_array(center),
             sides: sides.map(DVec2::from_array),
             tapers: [0.0; 2],

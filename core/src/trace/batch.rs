@@ -4,8 +4,9 @@
 //! it depends neither on the tree nor on the instruction set.
 
 use super::{
-    boxes::{BoxKernel, ScalarBoxes},
+    boxes::{BoxKernel, KernelWork},
     hit::{Nearest, between},
+    kernels::run_with_kernel,
     ray::{Hit, Ray, Shear},
     solid::Scratch,
     traversal::{Stack, Step, visit},
@@ -22,7 +23,7 @@ use crate::{
 /// Finds what each ray meets first.
 pub(crate) fn trace(view: &View<'_>, isa: Isa, rays: &[Ray], hits: &mut Vec<Hit>) {
     hits.clear();
-    dispatch(view, isa, &mut Trace { rays, hits });
+    run_with_kernel(isa, &mut Trace { view, rays, hits });
 }
 
 /// Finds which share of its light each ray, running to `light`, lets through: 0..=1.
@@ -36,53 +37,26 @@ pub(crate) fn trace_shadows(
     shares.clear();
     let touches = view.coincident_surfaces(light);
     if view.header.features.has_clear_shadows() {
-        dispatch(view, isa, &mut ClearShadows { rays, touches, shares });
+        run_with_kernel(isa, &mut ClearShadows { view, rays, touches, shares });
     } else {
-        dispatch(view, isa, &mut Shadows { rays, touches, shares });
+        run_with_kernel(isa, &mut Shadows { view, rays, touches, shares });
     }
-}
-
-/// Work on a batch of rays, the same for every instruction set.
-trait Batch {
-    fn run<K: BoxKernel>(&mut self, view: &View<'_>);
-}
-
-/// Runs a batch compiled for an instruction set, which must be supported.
-fn dispatch(view: &View<'_>, isa: Isa, batch: &mut impl Batch) {
-    assert!(isa.is_supported());
-    match isa {
-        Isa::Scalar => batch.run::<ScalarBoxes>(view),
-        #[cfg(target_arch = "x86_64")]
-        Isa::Sse2 => batch.run::<crate::trace::boxes::x86::Sse2Boxes>(view),
-        #[cfg(target_arch = "x86_64")]
-        #[expect(unsafe_code, reason = "a function compiled for AVX2")]
-        Isa::Avx2 => {
-            // SAFETY: this CPU has AVX2, asserted just above.
-            unsafe { run_avx2(view, batch) }
-        }
-        #[cfg(not(target_arch = "x86_64"))]
-        Isa::Sse2 | Isa::Avx2 => unreachable!("no other machine supports them"),
-    }
-}
-
-#[cfg(target_arch = "x86_64")]
-#[target_feature(enable = "avx2")]
-fn run_avx2(view: &View<'_>, batch: &mut impl Batch) {
-    batch.run::<crate::trace::boxes::x86::Avx2Boxes>(view);
 }
 
 struct Trace<'a> {
+    view: &'a View<'a>,
     rays: &'a [Ray],
     hits: &'a mut Vec<Hit>,
 }
 
-impl Batch for Trace<'_> {
+impl KernelWork for Trace<'_> {
     #[inline(always)]
-    fn run<K: BoxKernel>(&mut self, view: &View<'_>) {
+    fn run(&mut self, kernel: impl BoxKernel) {
+        let view = self.view;
         let (mut scratch, mut stack) = (Scratch::default(), Stack::default());
         for ray in self.rays {
             let mut nearest = Nearest::new(ray);
-            visit::<K>(view, ray, &mut stack, |item| {
+            visit(kernel, view, ray, &mut stack, |item| {
                 nearest.meet(view, item, &mut scratch);
                 Step::On(nearest.hit.t)
             });
@@ -93,19 +67,21 @@ impl Batch for Trace<'_> {
 
 /// Nothing lets light through: the first face decides.
 struct Shadows<'a> {
+    view: &'a View<'a>,
     rays: &'a [Ray],
     touches: &'a [Surface],
     shares: &'a mut Vec<f64>,
 }
 
-impl Batch for Shadows<'_> {
+impl KernelWork for Shadows<'_> {
     #[inline(always)]
-    fn run<K: BoxKernel>(&mut self, view: &View<'_>) {
+    fn run(&mut self, kernel: impl BoxKernel) {
+        let view = self.view;
         let (mut scratch, mut stack) = (Scratch::default(), Stack::default());
         for ray in self.rays {
             let shear = Shear::new(ray.origin, ray.direction);
             let mut is_blocked = false;
-            visit::<K>(view, ray, &mut stack, |item| {
+            visit(kernel, view, ray, &mut stack, |item| {
                 between(view, ray, &shear, self.touches, item, &mut scratch, |_, _| {
                     is_blocked = true;
                 });
@@ -118,21 +94,23 @@ impl Batch for Shadows<'_> {
 
 /// Every face counts.
 struct ClearShadows<'a> {
+    view: &'a View<'a>,
     rays: &'a [Ray],
     touches: &'a [Surface],
     shares: &'a mut Vec<f64>,
 }
 
-impl Batch for ClearShadows<'_> {
+impl KernelWork for ClearShadows<'_> {
     #[inline(always)]
-    fn run<K: BoxKernel>(&mut self, view: &View<'_>) {
+    fn run(&mut self, kernel: impl BoxKernel) {
+        let view = self.view;
         let (mut scratch, mut stack) = (Scratch::default(), Stack::default());
         let mut crossed: Vec<(u32, f64)> = Vec::new();
         for ray in self.rays {
             let shear = Shear::new(ray.origin, ray.direction);
             crossed.clear();
             let mut is_blocked = false;
-            visit::<K>(view, ray, &mut stack, |item| {
+            visit(kernel, view, ray, &mut stack, |item| {
                 between(view, ray, &shear, self.touches, item, &mut scratch, |rank, part| {
                     let share = Face { item, part }.material(view).transmittance();
                     is_blocked |= share == 0.0;

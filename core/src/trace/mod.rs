@@ -1,8 +1,12 @@
 //! Rays through a prepared scene: what they meet.
 
 pub(crate) mod batch;
-pub(crate) mod boxes;
-pub(crate) mod hit;
+mod boxes;
+#[cfg(target_arch = "x86_64")]
+#[expect(unsafe_code, reason = "SIMD intrinsics")]
+mod boxes_x86;
+mod hit;
+mod kernels;
 pub(crate) mod probe;
 pub(crate) mod quadrangle;
 pub(crate) mod ray;
@@ -10,5 +14,3 @@ pub(crate) mod solid;
 pub(crate) mod sphere;
 pub(crate) mod traversal;
 pub(crate) mod triangle;
-
-pub use probe::{FaceTests, Probe, ProbeHit};

@@ -77,9 +77,27 @@ impl FaceTests {
     }
 }
 
-impl<B: AsRef<[u8]>> PreparedScene<B> {
+/// What a prepared scene answers to single rays.
+pub trait Probing {
     /// What each probe meets first, found with the kernels of `isa`, which must be supported.
-    pub fn probe(&self, probes: &[Probe], isa: Isa) -> Vec<Option<ProbeHit>> {
+    fn probe(&self, probes: &[Probe], isa: Isa) -> Vec<Option<ProbeHit>>;
+
+    /// The same without the hierarchy: every face is tried.
+    fn probe_all_faces(&self, probes: &[Probe]) -> Vec<Option<ProbeHit>>;
+
+    /// How many nodes of the hierarchy each probe visits on its way to what it meets first.
+    fn count_visits(&self, probes: &[Probe]) -> Vec<u32>;
+
+    /// How many triangles and quadrangles the probes are tested against on their way to what
+    /// they meet first, and of how many tests rounded products did not suffice.
+    fn count_face_tests(&self, probes: &[Probe]) -> FaceTests;
+
+    /// How many faces each probe crosses.
+    fn count_crossings(&self, probes: &[Probe]) -> Vec<u32>;
+}
+
+impl<B: AsRef<[u8]>> Probing for PreparedScene<B> {
+    fn probe(&self, probes: &[Probe], isa: Isa) -> Vec<Option<ProbeHit>> {
         let view = self.view();
         let rays: Vec<Ray> = probes.iter().map(|probe| to_ray(&view, probe)).collect();
         let mut hits = Vec::with_capacity(rays.len());
@@ -87,8 +105,7 @@ impl<B: AsRef<[u8]>> PreparedScene<B> {
         hits.iter().map(|hit| from_hit(&view, hit)).collect()
     }
 
-    /// The same without the hierarchy: every face is tried.
-    pub fn probe_all_faces(&self, probes: &[Probe]) -> Vec<Option<ProbeHit>> {
+    fn probe_all_faces(&self, probes: &[Probe]) -> Vec<Option<ProbeHit>> {
         let view = self.view();
         let mut scratch = Scratch::default();
         let mut try_all = |probe: &Probe| {
@@ -100,15 +117,15 @@ impl<B: AsRef<[u8]>> PreparedScene<B> {
         probes.iter().map(&mut try_all).collect()
     }
 
-    /// How many nodes of the hierarchy each probe visits on its way to what it meets first.
-    pub fn count_visits(&self, probes: &[Probe]) -> Vec<u32> {
+    fn count_visits(&self, probes: &[Probe]) -> Vec<u32> {
         let view = self.view();
         let mut scratch = Scratch::default();
         let mut count = |probe: &Probe| {
             let ray = to_ray(&view, probe);
             let mut nearest = Nearest::new(&ray);
             let mut visits = 0;
-            visit_nodes::<ScalarBoxes>(
+            visit_nodes(
+                ScalarBoxes,
                 &view,
                 &ray,
                 &mut Stack::default(),
@@ -123,9 +140,7 @@ impl<B: AsRef<[u8]>> PreparedScene<B> {
         probes.iter().map(&mut count).collect()
     }
 
-    /// How many triangles and quadrangles the probes are tested against on their way to what
-    /// they meet first, and of how many tests rounded products did not suffice.
-    pub fn count_face_tests(&self, probes: &[Probe]) -> FaceTests {
+    fn count_face_tests(&self, probes: &[Probe]) -> FaceTests {
         let view = self.view();
         let (mut scratch, mut stack) = (Scratch::default(), Stack::default());
         let mut tests = FaceTests::default();
@@ -133,7 +148,7 @@ impl<B: AsRef<[u8]>> PreparedScene<B> {
             let ray = to_ray(&view, probe);
             let mut nearest = Nearest::new(&ray);
             let shear = nearest.shear;
-            visit::<ScalarBoxes>(&view, &ray, &mut stack, |item| {
+            visit(ScalarBoxes, &view, &ray, &mut stack, |item| {
                 tests.add(&view, &shear, item);
                 nearest.meet(&view, item, &mut scratch);
                 Step::On(nearest.hit.t)
@@ -142,15 +157,14 @@ impl<B: AsRef<[u8]>> PreparedScene<B> {
         tests
     }
 
-    /// How many faces each probe crosses.
-    pub fn count_crossings(&self, probes: &[Probe]) -> Vec<u32> {
+    fn count_crossings(&self, probes: &[Probe]) -> Vec<u32> {
         let view = self.view();
         let mut scratch = Scratch::default();
         let mut count = |probe: &Probe| {
             let ray = to_ray(&view, probe);
             let shear = Shear::new(ray.origin, ray.direction);
             let mut crossings = 0;
-            visit::<ScalarBoxes>(&view, &ray, &mut Stack::default(), |item| {
+            visit(ScalarBoxes, &view, &ray, &mut Stack::default(), |item| {
                 between(&view, &ray, &shear, &[], item, &mut scratch, |_, _| crossings += 1);
                 Step::On(ray.reach)
             });

@@ -32,18 +32,20 @@ pub(super) enum Step {
 
 /// Calls `meet` for the faces in the leaves that the ray enters, nearer boxes first.
 #[inline(always)]
-pub(super) fn visit<K: BoxKernel>(
+pub(super) fn visit(
+    kernel: impl BoxKernel,
     view: &View<'_>,
     ray: &Ray,
     stack: &mut Stack,
     meet: impl FnMut(Item) -> Step,
 ) {
-    visit_nodes::<K>(view, ray, stack, || (), meet);
+    visit_nodes(kernel, view, ray, stack, || (), meet);
 }
 
 /// The same, and calls `enter` for each node.
 #[inline(always)]
-pub(super) fn visit_nodes<K: BoxKernel>(
+pub(super) fn visit_nodes(
+    kernel: impl BoxKernel,
     view: &View<'_>,
     ray: &Ray,
     Stack(stack): &mut Stack,
@@ -64,7 +66,7 @@ pub(super) fn visit_nodes<K: BoxKernel>(
         } else {
             enter();
             let node = &view.nodes[current.node()];
-            let (distances, mut mask) = K::test(node, &box_ray);
+            let (distances, mut mask) = kernel.test(node, &box_ray);
             let first = waiting;
             while mask != 0 {
                 let child = mask.trailing_zeros() as usize & 7;

@@ -30,7 +30,8 @@ mod texture;
 pub mod closed_forms;
 pub mod known_pictures;
 
-// What tests throw at the oracle and at the tracer.
+// What tests throw at the oracle and at the tracer, and how they tell what they found.
+pub mod hard_case;
 pub mod random;
 pub mod random_scene;
 

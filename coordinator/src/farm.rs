@@ -1,0 +1,945 @@
+//! The coordinator's one machine: members, leases, stitching, counting, ending and waiting.
+//! Decisions alone: every event is a method that takes the time, and answers with what its shell
+//! is to do; nothing here waits, writes or logs.
+
+use std::{
+    collections::{BTreeMap, BTreeSet, VecDeque},
+    time::{Duration, Instant},
+};
+
+use rtfarm_core::{render::Tally, tile::TileId};
+use rtfarm_job::{Outcome, Progress};
+use rtfarm_proto::{JobId, LONGEST_WAIT, LeaseId, LeaseName, WorkerId};
+
+use crate::{
+    lease::{Leases, Loss, Run},
+    members::{Members, NoMember, Process},
+    tiles::{Arrival, PixelHash, Tiles},
+    waiting::{Ask, AskId, Waiting},
+};
+
+/// A worker that says nothing for this long is a member no more. One without work asks again
+/// after each wait at the latest.
+const LONGEST_SILENCE: Duration = LONGEST_WAIT.saturating_mul(6);
+
+/// Jobs that have ended and are kept for their clients.
+const KEPT_AFTER_END: usize = 16;
+
+/// How long workers may take to go home when the coordinator stops.
+const FAREWELL: Duration = Duration::from_millis(1500);
+
+/// Why jobs fail when the coordinator stops.
+const STOPPED: &str = "the coordinator was stopped";
+
+/// A farm. Invariants: every lease and every waiting question belongs to a member; a tile counts
+/// as done only after its pixels were stored; every question and every delivery gets exactly one
+/// answer.
+#[derive(Debug)]
+pub(crate) struct Farm {
+    term: Duration,
+    members: Members,
+    leases: Leases,
+    waiting: Waiting,
+    jobs: BTreeMap<JobId, JobState>,
+    /// Jobs that have ended and are kept, in the order of their ends.
+    ended: VecDeque<JobId>,
+    last_job: JobId,
+    phase: Phase,
+}
+
+/// What is counted of a job.
+#[derive(Debug)]
+struct JobState {
+    started: Instant,
+    progress: Progress,
+    contributors: BTreeSet<WorkerId>,
+    storing: BTreeMap<TileId, Storing>,
+}
+
+/// A tile whose pixels are on their way into the picture.
+#[derive(Debug)]
+struct Storing {
+    id: DeliveryId,
+    first: Delivery,
+    /// Copies that came meanwhile. They are answered when the first is safe.
+    copies: Vec<DeliveryId>,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Phase {
+    Open,
+    /// Workers that ask for tiles are sent home.
+    Closing,
+    /// The same, and the shell stops when they have gone, at that time at the latest.
+    Farewell(Instant),
+    Stopped,
+}
+
+/// Pixels that came. The shell numbers them.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub(crate) struct DeliveryId(pub(crate) u64);
+
+/// What came with the pixels of a tile.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Delivery {
+    pub(crate) worker: WorkerId,
+    pub(crate) lease: LeaseName,
+    pub(crate) tile: TileId,
+    pub(crate) hash: PixelHash,
+    /// Time on one thread.
+    pub(crate) seconds: f64,
+    pub(crate) tally: Tally,
+}
+
+/// The answer to a question for tiles.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) enum Next {
+    /// Render these tiles.
+    Render(Run),
+    /// There was nothing to do for as long as the worker would wait.
+    Nothing,
+    /// There will be nothing to do any more.
+    GoHome,
+}
+
+/// The answer to a delivery.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Verdict {
+    /// The pixels are in the picture.
+    Accepted,
+    /// Earlier pixels of the tile are in the picture.
+    Duplicate,
+    /// The job is over.
+    Rejected,
+}
+
+/// What the shell is to do, in this order.
+#[derive(Debug)]
+pub(crate) enum Action {
+    /// Answer a question for tiles.
+    Answer(AskId, Result<Next, NoMember>),
+    /// Write the pixels of a delivery into the picture of a job, then report
+    /// [`Farm::on_stored`] or [`Farm::on_store_failed`].
+    Store(DeliveryId, JobId, TileId),
+    /// Answer a delivery.
+    Acknowledge(DeliveryId, Verdict),
+    /// Show those who watch a job how far it is.
+    Publish(JobId, Progress),
+    /// Drop a job's scene and picture.
+    Forget(JobId),
+    /// Write a line into the log.
+    Log(Notice),
+    /// Close the connections: everybody has gone home, or had the time to.
+    Stop,
+}
+
+/// What a log line says.
+#[derive(Debug)]
+pub(crate) enum Notice {
+    /// A worker is new on the farm.
+    Joined(WorkerId, Process),
+    /// A worker without leases is gone, for that reason.
+    Gone(WorkerId, String),
+    /// A lease is lost, for that reason.
+    LeaseLost(Loss, String),
+    /// A tile is in the picture, as the last of those in `progress`, so long after the job's
+    /// start.
+    TileDone { delivery: Delivery, progress: Progress, elapsed: Duration },
+    /// A second copy of a tile has another hash than the first.
+    CopiesDiffer { second: Delivery, first: PixelHash },
+    /// A job failed, for that reason.
+    JobFailed(JobId, String),
+    /// A client cancelled a job.
+    JobCancelled(JobId),
+}
+
+impl Farm {
+    /// Makes a farm without members and jobs. A lease lives for `term` after the last progress.
+    pub(crate) fn new(term: Duration) -> Self {
+        Self {
+            term,
+            members: Members::new(LONGEST_SILENCE.max(term)),
+            leases: Leases::new(term),
+            waiting: Waiting::default(),
+            jobs: BTreeMap::new(),
+            ended: VecDeque::new(),
+            last_job: JobId(0),
+            phase: Phase::Open,
+        }
+    }
+
+    /// When [`Farm::on_time`] is to be called next, at the latest.
+    pub(crate) fn next_wake(&self) -> Option<Instant> {
+        let farewell = if let Phase::Farewell(until) = self.phase { Some(until) } else { None };
+        let deadline = self.waiting.next_deadline().map(|(until, _)| until);
+        let second = self.next_second_rendering().map(|(from, ..)| from);
+        let times =
+            [self.leases.next_expiry(), self.members.next_check(), deadline, second, farewell];
+        times.into_iter().flatten().min()
+    }
+
+    /// Event: time passes.
+    pub(crate) fn on_time(&mut self, now: Instant) -> Vec<Action> {
+        let mut actions = Vec::new();
+        for loss in self.leases.on_time(now) {
+            let reason = format!("no progress for {:.1} s", self.term.as_secs_f64());
+            actions.push(Action::Log(Notice::LeaseLost(loss, reason)));
+        }
+        for worker in self.members.on_time(now) {
+            let reason = format!("silent for {} s", LONGEST_SILENCE.max(self.term).as_secs());
+            self.lose_worker(worker, &reason, &mut actions);
+        }
+        self.serve(now, &mut actions);
+        self.end_farewell(now, &mut actions);
+        actions
+    }
+
+    // Members.
+
+    /// Event: a process joins. The same nonce gets the same number.
+    pub(crate) fn on_join(&mut self, process: Process, now: Instant) -> (WorkerId, Vec<Action>) {
+        let (worker, is_new) = self.members.on_join(&process, now);
+        let joined = is_new.then_some(Action::Log(Notice::Joined(worker, process)));
+        (worker, joined.into_iter().collect())
+    }
+
+    /// Event: a worker leaves, for that reason.
+    pub(crate) fn on_leave(&mut self, worker: WorkerId, reason: &str, now: Instant) -> Vec<Action> {
+        let mut actions = Vec::new();
+        self.lose_worker(worker, reason, &mut actions);
+        self.serve(now, &mut actions);
+        self.end_farewell(now, &mut actions);
+        actions
+    }
+
+    /// Event: a process on this machine, which may be a worker, has ended for that reason.
+    pub(crate) fn on_process_exit(
+        &mut self,
+        process: u32,
+        reason: &str,
+        now: Instant,
+    ) -> Vec<Action> {
+        let worker = self.members.in_process(process);
+        worker.map_or_else(Vec::new, |worker| self.on_leave(worker, reason, now))
+    }
+
+    fn lose_worker(&mut self, worker: WorkerId, reason: &str, actions: &mut Vec<Action>) {
+        let was_member = self.members.remove(worker);
+        if let Some(ask) = self.waiting.of(worker) {
+            self.waiting.remove(ask);
+            actions.push(Action::Answer(ask, Err(NoMember(worker))));
+        }
+        let losses = self.leases.on_worker_lost(worker);
+        if was_member && losses.is_empty() {
+            actions.push(Action::Log(Notice::Gone(worker, reason.to_owned())));
+        }
+        let log = |loss| Action::Log(Notice::LeaseLost(loss, reason.to_owned()));
+        actions.extend(losses.into_iter().map(log));
+    }
+
+    // Asking and waiting.
+
+    /// Event: a worker asks for tiles. It is answered at once when there are some; otherwise as
+    /// soon as there are, or when it would wait no longer. An older question that the worker still
+    /// has is answered with nothing.
+    pub(crate) fn on_ask(&mut self, id: AskId, ask: Ask, now: Instant) -> Vec<Action> {
+        let mut actions = Vec::new();
+        if self.phase != Phase::Open {
+            self.send_home(ask.worker, id, &mut actions);
+            self.end_farewell(now, &mut actions);
+            return actions;
+        }
+        if let Err(stranger) = self.members.on_sign_of_life(ask.worker, now) {
+            return vec![Action::Answer(id, Err(stranger))];
+        }
+        if let Some(older) = self.waiting.add(id, ask) {
+            actions.push(Action::Answer(older, Ok(Next::Nothing)));
+        }
+        self.serve(now, &mut actions);
+        actions
+    }
+
+    /// Event: nobody waits for the answer to a question any longer.
+    pub(crate) fn on_hang_up(&mut self, ask: AskId) {
+        self.waiting.remove(ask);
+    }
+
+    /// Answers the questions for which there is an answer now: free tiles go to those who wait
+    /// longest, then quiet leases are rendered a second time, then the rest may have waited
+    /// long enough.
+    fn serve(&mut self, now: Instant, actions: &mut Vec<Action>) {
+        while let Some((id, ask)) = self.waiting.first()
+            && let Some(run) = {
+                let threads = self.members.threads(ask.worker);
+                self.leases.on_idle(ask.worker, threads, ask.most, now)
+            }
+        {
+            self.waiting.remove(id);
+            actions.push(Action::Answer(id, Ok(Next::Render(run))));
+        }
+        while let Some((from, id, quiet)) = self.next_second_rendering()
+            && from <= now
+            && let Some(ask) = self.waiting.remove(id)
+        {
+            let run = self.leases.on_idle_at_the_end(ask.worker, quiet, now);
+            let run = run.expect("a quiet lease holds a tile that no other lease holds");
+            actions.push(Action::Answer(id, Ok(Next::Render(run))));
+        }
+        while let Some((until, id)) = self.waiting.next_deadline()
+            && until <= now
+        {
+            self.waiting.remove(id);
+            actions.push(Action::Answer(id, Ok(Next::Nothing)));
+        }
+    }
+
+    /// From when on which waiting question can be answered with a tile of which quiet lease.
+    fn next_second_rendering(&self) -> Option<(Instant, AskId, LeaseId)> {
+        self.waiting.first()?;
+        // With two that wait, the first lease will do; with one, all but its own.
+        self.leases.quietest().find_map(|(from, holder, quiet)| {
+            let ask = self.waiting.first_but(holder)?;
+            Some((from, ask, quiet))
+        })
+    }
+
+    // Rendering and stitching.
+
+    /// Event: a worker goes on rendering under `leases`. Answers with those that it has lost.
+    pub(crate) fn on_renew(
+        &mut self,
+        worker: WorkerId,
+        leases: &[LeaseName],
+        now: Instant,
+    ) -> Result<Vec<LeaseName>, NoMember> {
+        self.members.on_sign_of_life(worker, now)?;
+        let lost = leases.iter().filter(|&&lease| !self.leases.on_progress(worker, lease, now));
+        Ok(lost.copied().collect())
+    }
+
+    /// Turns a number from the wire into a tile of a job that is being rendered.
+    pub(crate) fn tile(&self, job: JobId, number: u32) -> Option<TileId> {
+        self.leases.tiles(job)?.grid().tile(number)
+    }
+
+    /// Event: pixels came. The first of a tile are stored, and acknowledged when that is done.
+    pub(crate) fn on_pixels(
+        &mut self,
+        id: DeliveryId,
+        delivery: Delivery,
+        now: Instant,
+    ) -> Vec<Action> {
+        let Delivery { worker, lease, tile, hash, .. } = delivery;
+        // Pixels are welcome from anyone: a worker may have been given up meanwhile.
+        let _ = self.members.on_sign_of_life(worker, now);
+        let arrival = self.leases.on_pixels(worker, lease, tile, hash, now);
+        let (Some(arrival), Some(job)) = (arrival, self.jobs.get_mut(&lease.job)) else {
+            return vec![Action::Acknowledge(id, Verdict::Rejected)];
+        };
+        let mut actions = Vec::new();
+        let (Arrival::WhileStoring(first) | Arrival::AfterDone(first)) = arrival else {
+            job.storing.insert(tile, Storing { id, first: delivery, copies: Vec::new() });
+            return vec![Action::Store(id, lease.job, tile)];
+        };
+        if first != hash {
+            job.progress.differing_tiles += 1;
+            actions.push(Action::Publish(lease.job, job.progress.clone()));
+            actions.push(Action::Log(Notice::CopiesDiffer { second: delivery, first }));
+        }
+        match job.storing.get_mut(&tile) {
+            Some(storing) => storing.copies.push(id),
+            None => actions.push(Action::Acknowledge(id, Verdict::Duplicate)),
+        }
+        actions
+    }
+
+    /// Event: a worker brought pixels of a tile that make no sense, for that reason.
+    pub(crate) fn on_senseless_pixels(
+        &mut self,
+        worker: WorkerId,
+        job: JobId,
+        tile: TileId,
+        reason: &str,
+    ) -> Vec<Action> {
+        let mut actions = Vec::new();
+        let reason = format!("worker {worker} rendered tile {}: {reason}", tile.number());
+        self.fail(job, reason, &mut actions);
+        actions
+    }
+
+    /// Event: the pixels of a tile are in the picture.
+    pub(crate) fn on_stored(&mut self, id: JobId, tile: TileId, now: Instant) -> Vec<Action> {
+        let Some(job) = self.jobs.get_mut(&id) else { return Vec::new() };
+        // Nothing is stored of a job that has ended: its deliveries are answered already.
+        let Some(storing) = job.storing.remove(&tile) else { return Vec::new() };
+        let done = self.leases.on_stored(id, tile).expect("a job that stores has not ended");
+        let delivery = storing.first;
+        job.contributors.insert(delivery.worker);
+        job.progress.tiles_done = done;
+        job.progress.tally.add(&delivery.tally);
+        job.progress.worker_count = job.contributors.len() as u32;
+        let (progress, elapsed) = (job.progress.clone(), now - job.started);
+        let mut actions = vec![Action::Acknowledge(storing.id, Verdict::Accepted)];
+        let copies = storing.copies.into_iter();
+        actions.extend(copies.map(|copy| Action::Acknowledge(copy, Verdict::Duplicate)));
+        let is_last = progress.tiles_done == progress.tile_count;
+        actions.push(Action::Publish(id, progress.clone()));
+        actions.push(Action::Log(Notice::TileDone { delivery, progress, elapsed }));
+        if is_last {
+            self.end(id, Outcome::Finished(elapsed), &mut actions);
+        }
+        actions
+    }
+
+    /// Event: the pixels of a tile cannot be written, for that reason.
+    pub(crate) fn on_store_failed(&mut self, job: JobId, reason: String) -> Vec<Action> {
+        let mut actions = Vec::new();
+        self.fail(job, reason, &mut actions);
+        actions
+    }
+
+    // Jobs.
+
+    /// Gives a number to a job to come.
+    pub(crate) fn number_job(&mut self) -> JobId {
+        self.last_job.0 += 1;
+        self.last_job
+    }
+
+    /// Event: a picture of these tiles, all of them free, is ordered under a number from
+    /// [`Farm::number_job`].
+    pub(crate) fn on_submit(&mut self, id: JobId, tiles: Tiles, now: Instant) -> Vec<Action> {
+        let progress = Progress { tile_count: tiles.grid().count(), ..Progress::default() };
+        let (contributors, storing) = (BTreeSet::new(), BTreeMap::new());
+        self.jobs.insert(id, JobState { started: now, progress, contributors, storing });
+        self.leases.on_submit(id, tiles);
+        let mut actions = Vec::new();
+        if self.phase == Phase::Open {
+            self.serve(now, &mut actions);
+        } else {
+            self.fail(id, STOPPED.to_owned(), &mut actions);
+        }
+        actions
+    }
+
+    /// Event: nobody wants a job's picture any more.
+    pub(crate) fn on_cancel(&mut self, job: JobId) -> Vec<Action> {
+        let mut actions = Vec::new();
+        if self.end(job, Outcome::Failed("it was cancelled".to_owned()), &mut actions) {
+            actions.push(Action::Log(Notice::JobCancelled(job)));
+        }
+        self.ended.retain(|&ended| ended != job);
+        self.forget(job, &mut actions);
+        actions
+    }
+
+    fn fail(&mut self, job: JobId, reason: String, actions: &mut Vec<Action>) {
+        if self.end(job, Outcome::Failed(reason.clone()), actions) {
+            actions.push(Action::Log(Notice::JobFailed(job, reason)));
+        }
+    }
+
+    /// Ends a job, unless it has ended; says whether it had not. What is being stored of it is
+    /// not needed any more.
+    fn end(&mut self, id: JobId, outcome: Outcome, actions: &mut Vec<Action>) -> bool {
+        let Some(job) = self.jobs.get_mut(&id) else { return false };
+        if job.progress.outcome.is_some() {
+            return false;
+        }
+        job.progress.outcome = Some(outcome);
+        actions.push(Action::Publish(id, job.progress.clone()));
+        for storing in std::mem::take(&mut job.storing).into_values() {
+            let deliveries = std::iter::once(storing.id).chain(storing.copies);
+            actions.extend(deliveries.map(|id| Action::Acknowledge(id, Verdict::Rejected)));
+        }
+        self.leases.on_end(id);
+        self.ended.push_back(id);
+        if self.ended.len() > KEPT_AFTER_END
+            && let Some(oldest) = self.ended.pop_front()
+        {
+            self.forget(oldest, actions);
+        }
+        true
+    }
+
+    fn forget(&mut self, job: JobId, actions: &mut Vec<Action>) {
+        if self.jobs.remove(&job).is_some() {
+            actions.push(Action::Forget(job));
+        }
+    }
+
+    // Stopping.
+
+    /// Event: there will be no more work. Workers are sent home.
+    pub(crate) fn on_close(&mut self) -> Vec<Action> {
+        let mut actions = Vec::new();
+        if self.phase == Phase::Open {
+            self.phase = Phase::Closing;
+        }
+        while let Some((id, ask)) = self.waiting.first() {
+            self.waiting.remove(id);
+            self.send_home(ask.worker, id, &mut actions);
+        }
+        actions
+    }
+
+    /// Event: the coordinator is to stop. Workers are sent home, and every job has ended.
+    pub(crate) fn on_shut_down(&mut self, now: Instant) -> Vec<Action> {
+        let mut actions = self.on_close();
+        let jobs: Vec<JobId> = self.jobs.keys().copied().collect();
+        for job in jobs {
+            self.fail(job, STOPPED.to_owned(), &mut actions);
+        }
+        self.phase = Phase::Farewell(now + FAREWELL);
+        self.end_farewell(now, &mut actions);
+        actions
+    }
+
+    /// Sends a worker home. Its leases end with it; since that is no misfortune, nobody is told.
+    fn send_home(&mut self, worker: WorkerId, ask: AskId, actions: &mut Vec<Action>) {
+        self.members.remove(worker);
+        self.leases.on_worker_lost(worker);
+        actions.push(Action::Answer(ask, Ok(Next::GoHome)));
+    }
+
+    fn end_farewell(&mut self, now: Instant, actions: &mut Vec<Action>) {
+        if let Phase::Farewell(until) = self.phase
+            && (self.members.is_empty() || until <= now)
+        {
+            self.phase = Phase::Stopped;
+            actions.push(Action::Stop);
+        }
+    }
+}
+
+#[cfg(test)]
+impl Farm {
+    /// Checks every invariant, at the price of a scan.
+    pub(crate) fn check(&self) {
+        let is_member = |worker| self.members.contains(worker);
+        self.members.check();
+        self.leases.check(is_member);
+        self.waiting.check(is_member);
+        for (id, job) in &self.jobs {
+            let tiles = self.leases.tiles(*id);
+            assert_eq!(tiles.is_some(), job.progress.outcome.is_none());
+            assert_eq!(self.ended.contains(id), job.progress.outcome.is_some());
+            let done = tiles.map_or(job.progress.tiles_done, Tiles::done_count);
+            assert_eq!(done, job.progress.tiles_done);
+            assert!(tiles.is_some() || job.storing.is_empty());
+        }
+        assert!(self.ended.len() <= KEPT_AFTER_END);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use rtfarm_core::tile::{Size, TileGrid};
+
+    use super::*;
+
+    const TERM: Duration = Duration::from_secs(4);
+    const SECOND: Duration = Duration::from_secs(1);
+
+    /// A farm and its clock.
+    struct World {
+        farm: Farm,
+        now: Instant,
+        last_number: u64,
+    }
+
+    impl World {
+        fn new() -> Self {
+            #[expect(clippy::disallowed_methods, reason = "any instant will do")]
+            let now = Instant::now();
+            Self { farm: Farm::new(TERM), now, last_number: 0 }
+        }
+
+        fn number(&mut self) -> u64 {
+            self.last_number += 1;
+            self.last_number
+        }
+
+        fn join(&mut self) -> WorkerId {
+            let nonce = self.number();
+            let process = Process { nonce, number: nonce as u32, threads: 1, ..Process::default() };
+            self.farm.on_join(process, self.now).0
+        }
+
+        /// Orders a picture of a row of tiles; answers also with what that leads to.
+        fn submit(&mut self, tile_count: u64) -> (JobId, Vec<Action>) {
+            let grid = TileGrid::new(Size::new(tile_count * 16, 16).unwrap(), 16).unwrap();
+            let job = self.farm.number_job();
+            let actions = self.farm.on_submit(job, Tiles::new(grid), self.now);
+            self.farm.check();
+            (job, actions)
+        }
+
+        /// Asks for up to nine tiles.
+        fn ask(&mut self, worker: WorkerId, wait: Duration) -> (AskId, Vec<Action>) {
+            let id = AskId(self.number());
+            let ask = Ask { worker, most: 9, until: self.now + wait };
+            let actions = self.farm.on_ask(id, ask, self.now);
+            self.farm.check();
+            (id, actions)
+        }
+
+        /// Asks and gets tiles at once.
+        fn lease(&mut self, worker: WorkerId) -> Run {
+            let (id, actions) = self.ask(worker, Duration::ZERO);
+            let [(answered, Ok(Next::Render(run)))] = &answers(&actions)[..] else {
+                panic!("{actions:?}")
+            };
+            assert_eq!(*answered, id);
+            run.clone()
+        }
+
+        fn deliver(&mut self, worker: WorkerId, run: &Run, hash: u8) -> (DeliveryId, Vec<Action>) {
+            let id = DeliveryId(self.number());
+            let delivery = Delivery {
+                worker,
+                lease: run.lease,
+                tile: run.tiles[0],
+                hash: [hash; 32],
+                seconds: 0.1,
+                tally: Tally { rays: 10, ..Tally::default() },
+            };
+            let actions = self.farm.on_pixels(id, delivery, self.now);
+            self.farm.check();
+            (id, actions)
+        }
+
+        fn store(&mut self, run: &Run) -> Vec<Action> {
+            let actions = self.farm.on_stored(run.lease.job, run.tiles[0], self.now);
+            self.farm.check();
+            actions
+        }
+
+        /// Brings and stores the first tile of a run; answers with what the storing leads to.
+        fn stitch(&mut self, worker: WorkerId, run: &Run) -> Vec<Action> {
+            let (id, actions) = self.deliver(worker, run, 7);
+            assert!(matches!(actions[..], [Action::Store(stored, ..)] if stored == id));
+            self.store(run)
+        }
+
+        fn pass(&mut self, time: Duration) -> Vec<Action> {
+            self.now += time;
+            let actions = self.farm.on_time(self.now);
+            self.farm.check();
+            actions
+        }
+    }
+
+    fn answers(actions: &[Action]) -> Vec<(AskId, Result<Next, NoMember>)> {
+        let answer = |action: &Action| match action {
+            Action::Answer(ask, answer) => Some((*ask, answer.clone())),
+            _ => None,
+        };
+        actions.iter().filter_map(answer).collect()
+    }
+
+    fn verdicts(actions: &[Action]) -> Vec<(DeliveryId, Verdict)> {
+        let verdict = |action: &Action| match action {
+            Action::Acknowledge(delivery, verdict) => Some((*delivery, *verdict)),
+            _ => None,
+        };
+        actions.iter().filter_map(verdict).collect()
+    }
+
+    /// The last state that was published.
+    fn shown(actions: &[Action]) -> Progress {
+        let shown = |action: &Action| match action {
+            Action::Publish(_, progress) => Some(progress.clone()),
+            _ => None,
+        };
+        actions.iter().rev().find_map(shown).expect("something is published")
+    }
+
+    /// The jobs that are forgotten.
+    fn forgotten(actions: &[Action]) -> Vec<JobId> {
+        let job =
+            |action: &Action| if let Action::Forget(job) = action { Some(*job) } else { None };
+        actions.iter().filter_map(job).collect()
+    }
+
+    #[test]
+    fn a_tile_counts_and_is_acknowledged_when_it_is_stored() {
+        let mut world = World::new();
+        let worker = world.join();
+        world.submit(2);
+        let run = world.lease(worker);
+        let (id, actions) = world.deliver(worker, &run, 7);
+        assert!(matches!(actions[..], [Action::Store(..)]), "{actions:?}");
+        let actions = world.store(&run);
+        assert_eq!(verdicts(&actions), [(id, Verdict::Accepted)]);
+        let progress = shown(&actions);
+        assert_eq!((progress.tiles_done, progress.worker_count, progress.tally.rays), (1, 1, 10));
+        assert_eq!(progress.outcome, None);
+    }
+
+    #[test]
+    fn a_job_is_finished_with_its_last_tile_so_long_after_its_start() {
+        let mut world = World::new();
+        let worker = world.join();
+        world.submit(2);
+        for _ in 0..2 {
+            let run = world.lease(worker);
+            world.now += SECOND;
+            let actions = world.stitch(worker, &run);
+            let progress = shown(&actions);
+            let is_last = progress.tiles_done == 2;
+            assert_eq!(progress.outcome, is_last.then_some(Outcome::Finished(2 * SECOND)));
+        }
+    }
+
+    #[test]
+    fn a_copy_that_comes_while_the_first_is_stored_waits_for_it() {
+        let mut world = World::new();
+        let worker = world.join();
+        world.submit(2);
+        let run = world.lease(worker);
+        let (first, _) = world.deliver(worker, &run, 7);
+        let (copy, actions) = world.deliver(worker, &run, 7);
+        assert!(actions.is_empty(), "{actions:?}");
+        let expected = [(first, Verdict::Accepted), (copy, Verdict::Duplicate)];
+        assert_eq!(verdicts(&world.store(&run)), expected);
+        let (late, actions) = world.deliver(worker, &run, 7);
+        assert_eq!(verdicts(&actions), [(late, Verdict::Duplicate)]);
+    }
+
+    #[test]
+    fn a_picture_that_cannot_be_written_ends_its_job() {
+        let mut world = World::new();
+        let worker = world.join();
+        let (job, _) = world.submit(2);
+        let run = world.lease(worker);
+        let (first, _) = world.deliver(worker, &run, 7);
+        let (copy, _) = world.deliver(worker, &run, 7);
+        let actions = world.farm.on_store_failed(job, "the disk is full".to_owned());
+        let expected = [(first, Verdict::Rejected), (copy, Verdict::Rejected)];
+        assert_eq!(verdicts(&actions), expected);
+        let failed = Outcome::Failed("the disk is full".to_owned());
+        assert_eq!(shown(&actions).outcome, Some(failed));
+        let (late, actions) = world.deliver(worker, &run, 7);
+        assert_eq!(verdicts(&actions), [(late, Verdict::Rejected)]);
+    }
+
+    #[test]
+    fn a_copy_that_differs_is_counted_once_each_time() {
+        let mut world = World::new();
+        let worker = world.join();
+        world.submit(2);
+        let run = world.lease(worker);
+        world.stitch(worker, &run);
+        for count in 1..3 {
+            let (_, actions) = world.deliver(worker, &run, 8);
+            assert_eq!(shown(&actions).differing_tiles, count);
+        }
+    }
+
+    #[test]
+    fn pixels_that_make_no_sense_end_the_job_and_say_whose_they_were() {
+        let mut world = World::new();
+        let worker = world.join();
+        let (job, _) = world.submit(2);
+        let tile = world.farm.tile(job, 1).unwrap();
+        let actions = world.farm.on_senseless_pixels(worker, job, tile, "it is not a number");
+        let reason = "worker 1 rendered tile 1: it is not a number".to_owned();
+        assert_eq!(shown(&actions).outcome, Some(Outcome::Failed(reason)));
+        assert_eq!(world.farm.tile(job, 1), None);
+    }
+
+    #[test]
+    fn a_later_job_starts_when_the_earlier_has_no_free_tile() {
+        let mut world = World::new();
+        let worker = world.join();
+        for job in [world.submit(1).0, world.submit(1).0] {
+            assert_eq!(world.lease(worker).lease.job, job);
+        }
+        let (id, actions) = world.ask(worker, Duration::ZERO);
+        assert_eq!(answers(&actions), [(id, Ok(Next::Nothing))]);
+    }
+
+    #[test]
+    fn those_who_wait_longest_are_served_first() {
+        let mut world = World::new();
+        let workers = [world.join(), world.join(), world.join()];
+        let asks = workers.map(|worker| world.ask(worker, 9 * SECOND).0);
+        let (job, actions) = world.submit(2);
+        let served: Vec<AskId> = answers(&actions).iter().map(|(ask, _)| *ask).collect();
+        assert_eq!(served, asks[..2]);
+        assert!(matches!(&answers(&actions)[0].1, Ok(Next::Render(run)) if run.lease.job == job));
+    }
+
+    #[test]
+    fn a_wait_ends_when_it_is_over() {
+        let mut world = World::new();
+        let worker = world.join();
+        let (ask, actions) = world.ask(worker, 9 * SECOND);
+        assert!(actions.is_empty());
+        assert_eq!(world.farm.next_wake(), Some(world.now + 9 * SECOND));
+        assert!(world.pass(8 * SECOND).is_empty());
+        assert_eq!(answers(&world.pass(SECOND)), [(ask, Ok(Next::Nothing))]);
+    }
+
+    #[test]
+    fn tiles_of_a_lost_lease_go_to_a_worker_that_waits() {
+        for is_told in [true, false] {
+            let mut world = World::new();
+            let (lost, waiting) = (world.join(), world.join());
+            world.submit(1);
+            let run = world.lease(lost);
+            let (ask, actions) = world.ask(waiting, 9 * SECOND);
+            assert!(actions.is_empty());
+            let (actions, why) = if is_told {
+                let why = "killed by signal 9";
+                (world.farm.on_process_exit(1, why, world.now), why)
+            } else {
+                (world.pass(TERM), "no progress for 4.0 s")
+            };
+            let Action::Log(Notice::LeaseLost(loss, reason)) = &actions[0] else {
+                panic!("{actions:?}")
+            };
+            assert_eq!((loss.lease, &loss.tiles, &reason[..]), (run.lease, &run.tiles, why));
+            let [(answered, Ok(Next::Render(again)))] = &answers(&actions)[..] else {
+                panic!("{actions:?}")
+            };
+            assert_eq!((*answered, &again.tiles), (ask, &run.tiles));
+        }
+    }
+
+    #[test]
+    fn a_tile_of_a_quiet_lease_goes_to_another_worker_that_waits() {
+        let mut world = World::new();
+        let (quiet, idle) = (world.join(), world.join());
+        world.submit(1);
+        let (run, start) = (world.lease(quiet), world.now);
+        world.ask(quiet, 9 * SECOND);
+        assert_eq!(world.farm.next_wake(), Some(world.now + TERM), "its own tile is not for it");
+        let (ask, _) = world.ask(idle, 9 * SECOND);
+        let wake = world.farm.next_wake().unwrap();
+        assert!(wake < world.now + TERM);
+        let actions = world.pass(wake - world.now);
+        let [(answered, Ok(Next::Render(again)))] = &answers(&actions)[..] else {
+            panic!("{actions:?}")
+        };
+        assert_eq!((*answered, &again.tiles), (ask, &run.tiles));
+        assert_eq!(world.farm.next_wake(), Some(start + TERM), "and only once");
+    }
+
+    #[test]
+    fn a_silent_worker_is_forgotten_and_told_so() {
+        let mut world = World::new();
+        let worker = world.join();
+        let actions = world.pass(LONGEST_SILENCE);
+        assert!(matches!(actions[..], [Action::Log(Notice::Gone(gone, _))] if gone == worker));
+        let (ask, actions) = world.ask(worker, SECOND);
+        assert_eq!(answers(&actions), [(ask, Err(NoMember(worker)))]);
+        assert_eq!(world.farm.on_renew(worker, &[], world.now), Err(NoMember(worker)));
+    }
+
+    #[test]
+    fn a_worker_that_leaves_waits_no_longer() {
+        let mut world = World::new();
+        let worker = world.join();
+        let (ask, _) = world.ask(worker, SECOND);
+        let actions = world.farm.on_leave(worker, "it was stopped", world.now);
+        assert_eq!(answers(&actions), [(ask, Err(NoMember(worker)))]);
+        assert!(answers(&world.submit(1).1).is_empty());
+    }
+
+    #[test]
+    fn a_second_question_of_a_worker_ends_the_first() {
+        let mut world = World::new();
+        let worker = world.join();
+        let (first, _) = world.ask(worker, SECOND);
+        let (second, actions) = world.ask(worker, SECOND);
+        assert_eq!(answers(&actions), [(first, Ok(Next::Nothing))]);
+        assert_eq!(answers(&world.submit(1).1)[0].0, second);
+    }
+
+    #[test]
+    fn who_hangs_up_gets_no_lease() {
+        let mut world = World::new();
+        let worker = world.join();
+        let (ask, _) = world.ask(worker, SECOND);
+        world.farm.on_hang_up(ask);
+        let (_, actions) = world.submit(1);
+        assert!(answers(&actions).is_empty());
+        assert_eq!(world.lease(worker).lease.id, LeaseId(1), "it is the first");
+    }
+
+    #[test]
+    fn a_cancelled_job_fails_for_those_who_watch_and_is_forgotten() {
+        let mut world = World::new();
+        let worker = world.join();
+        let (job, _) = world.submit(2);
+        let run = world.lease(worker);
+        let (delivery, _) = world.deliver(worker, &run, 7);
+        let actions = world.farm.on_cancel(job);
+        world.farm.check();
+        let reason = Outcome::Failed("it was cancelled".to_owned());
+        assert_eq!(shown(&actions).outcome, Some(reason));
+        assert_eq!(verdicts(&actions), [(delivery, Verdict::Rejected)]);
+        assert_eq!(forgotten(&actions), [job]);
+        assert!(world.store(&run).is_empty(), "nobody wants it any more");
+        assert_eq!(world.farm.on_renew(worker, &[run.lease], world.now), Ok(vec![run.lease]));
+        assert!(world.farm.on_cancel(job).is_empty(), "there is no such job");
+    }
+
+    #[test]
+    fn the_last_jobs_to_end_are_kept() {
+        let mut world = World::new();
+        let worker = world.join();
+        let waiting = world.submit(1).0;
+        let first = world.lease(worker);
+        for _ in 0..KEPT_AFTER_END {
+            world.submit(1);
+            let run = world.lease(worker);
+            assert!(forgotten(&world.stitch(worker, &run)).is_empty());
+        }
+        let actions = world.stitch(worker, &first);
+        assert_eq!(forgotten(&actions), [JobId(waiting.0 + 1)], "the first that ended");
+        assert_eq!(forgotten(&world.farm.on_cancel(waiting)), [waiting], "fetched or not wanted");
+        world.farm.check();
+    }
+
+    #[test]
+    fn a_farm_that_closes_sends_home_who_asks() {
+        let mut world = World::new();
+        let (waiting, busy) = (world.join(), world.join());
+        let (ask, _) = world.ask(waiting, 9 * SECOND);
+        let actions = world.farm.on_close();
+        world.farm.check();
+        assert_eq!(answers(&actions), [(ask, Ok(Next::GoHome))]);
+        let (ask, actions) = world.ask(busy, 9 * SECOND);
+        assert_eq!(answers(&actions), [(ask, Ok(Next::GoHome))]);
+        assert_eq!(actions.len(), 1, "to close is not to stop: {actions:?}");
+    }
+
+    #[test]
+    fn a_farm_that_shuts_down_ends_every_job_and_stops_with_the_last_worker() {
+        for comes in [true, false] {
+            let mut world = World::new();
+            let worker = world.join();
+            let (job, _) = world.submit(2);
+            world.lease(worker);
+            let actions = world.farm.on_shut_down(world.now);
+            world.farm.check();
+            let stopped = Outcome::Failed("the coordinator was stopped".to_owned());
+            assert_eq!(shown(&actions).outcome, Some(stopped.clone()));
+            assert!(!actions.iter().any(|action| matches!(action, Action::Stop)));
+            assert_eq!(world.farm.tile(job, 0), None);
+            let actions = if comes {
+                let (ask, actions) = world.ask(worker, 9 * SECOND);
+                assert_eq!(answers(&actions), [(ask, Ok(Next::GoHome))]);
+                actions
+            } else {
+                assert_eq!(world.farm.next_wake(), Some(world.now + FAREWELL));
+                world.pass(FAREWELL)
+            };
+            assert!(matches!(actions.last(), Some(Action::Stop)), "{actions:?}");
+            assert_eq!(shown(&world.submit(1).1).outcome, Some(stopped), "it comes too late");
+        }
+    }
+}

@@ -1,0 +1,222 @@
+//! Who is on the farm. Decisions alone: time is an argument, nothing waits.
+
+use std::{
+    collections::{BTreeMap, BTreeSet},
+    time::{Duration, Instant},
+};
+
+use rtfarm_proto::WorkerId;
+
+/// A process that joins, as it describes itself.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub(crate) struct Process {
+    /// Random, one for each start of a process.
+    pub(crate) nonce: u64,
+    /// Its number on its host.
+    pub(crate) number: u32,
+    pub(crate) threads: usize,
+    pub(crate) host: String,
+    pub(crate) isa: String,
+}
+
+/// A number that is no member's: it never was one, or its worker has left or was silent too long.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+#[error("{0} is not a worker of this farm now; join again")]
+pub(crate) struct NoMember(pub(crate) WorkerId);
+
+/// The workers of a farm. Invariants: each member has one entry in every index; that in `checks`
+/// is never later than the moment when its silence becomes too long.
+#[derive(Debug)]
+pub(crate) struct Members {
+    longest_silence: Duration,
+    last_id: WorkerId,
+    by_id: BTreeMap<WorkerId, Member>,
+    by_nonce: BTreeMap<u64, WorkerId>,
+    by_process: BTreeSet<(u32, WorkerId)>,
+    checks: BTreeSet<(Instant, WorkerId)>,
+    threads: usize,
+}
+
+#[derive(Debug)]
+struct Member {
+    nonce: u64,
+    process: u32,
+    threads: usize,
+    last_heard: Instant,
+    /// When its silence is looked at. A sign of life does not move it, the look itself does: so
+    /// one is as cheap as can be.
+    check_at: Instant,
+}
+
+impl Members {
+    /// Makes a farm without members; one that says nothing for `longest_silence` is forgotten.
+    pub(crate) fn new(longest_silence: Duration) -> Self {
+        Self {
+            longest_silence,
+            last_id: WorkerId(0),
+            by_id: BTreeMap::new(),
+            by_nonce: BTreeMap::new(),
+            by_process: BTreeSet::new(),
+            checks: BTreeSet::new(),
+            threads: 0,
+        }
+    }
+
+    /// Event: a process joins. Its nonce tells a repeated question from a new process. Says also
+    /// whether the member is new.
+    pub(crate) fn on_join(&mut self, process: &Process, now: Instant) -> (WorkerId, bool) {
+        if let Some(&worker) = self.by_nonce.get(&process.nonce) {
+            let is_member = self.on_sign_of_life(worker, now).is_ok();
+            debug_assert!(is_member, "the index has members only");
+            return (worker, false);
+        }
+        self.last_id.0 += 1;
+        let worker = self.last_id;
+        let member = Member {
+            nonce: process.nonce,
+            process: process.number,
+            threads: process.threads.max(1),
+            last_heard: now,
+            check_at: now + self.longest_silence,
+        };
+        self.by_nonce.insert(member.nonce, worker);
+        self.by_process.insert((member.process, worker));
+        self.checks.insert((member.check_at, worker));
+        self.threads += member.threads;
+        self.by_id.insert(worker, member);
+        (worker, true)
+    }
+
+    /// Event: a worker says something.
+    pub(crate) fn on_sign_of_life(
+        &mut self,
+        worker: WorkerId,
+        now: Instant,
+    ) -> Result<(), NoMember> {
+        let member = self.by_id.get_mut(&worker).ok_or(NoMember(worker))?;
+        member.last_heard = now;
+        Ok(())
+    }
+
+    /// Removes a worker; says whether it was a member.
+    pub(crate) fn remove(&mut self, worker: WorkerId) -> bool {
+        let Some(member) = self.by_id.remove(&worker) else { return false };
+        self.by_nonce.remove(&member.nonce);
+        self.by_process.remove(&(member.process, worker));
+        self.checks.remove(&(member.check_at, worker));
+        self.threads -= member.threads;
+        true
+    }
+
+    /// Event: time passes. Answers with members that have been silent for too long; the caller
+    /// removes them.
+    pub(crate) fn on_time(&mut self, now: Instant) -> Vec<WorkerId> {
+        let mut silent = Vec::new();
+        while let Some(&(check_at, worker)) = self.checks.first()
+            && check_at <= now
+        {
+            self.checks.pop_first();
+            let Some(member) = self.by_id.get_mut(&worker) else { continue };
+            member.check_at = member.last_heard + self.longest_silence;
+            if member.check_at <= now {
+                silent.push(worker);
+            } else {
+                self.checks.insert((member.check_at, worker));
+            }
+        }
+        silent
+    }
+
+    /// When [`Members::on_time`] is to be called next, at the latest.
+    pub(crate) fn next_check(&self) -> Option<Instant> {
+        self.checks.first().map(|&(check_at, _)| check_at)
+    }
+
+    /// The threads of a worker, and those of all members.
+    pub(crate) fn threads(&self, worker: WorkerId) -> (usize, usize) {
+        (self.by_id.get(&worker).map_or(0, |member| member.threads), self.threads)
+    }
+
+    /// The first member that runs in the process with that number.
+    pub(crate) fn in_process(&self, process: u32) -> Option<WorkerId> {
+        let of_process = (process, WorkerId(0))..=(process, WorkerId(u32::MAX));
+        self.by_process.range(of_process).next().map(|&(_, worker)| worker)
+    }
+
+    /// Says whether there is nobody.
+    pub(crate) fn is_empty(&self) -> bool {
+        self.by_id.is_empty()
+    }
+}
+
+#[cfg(test)]
+impl Members {
+    pub(crate) fn contains(&self, worker: WorkerId) -> bool {
+        self.by_id.contains_key(&worker)
+    }
+
+    /// Checks every invariant, at the price of a scan.
+    pub(crate) fn check(&self) {
+        let members = || self.by_id.iter();
+        assert!(self.by_nonce == members().map(|(&id, member)| (member.nonce, id)).collect());
+        assert!(self.by_process == members().map(|(&id, member)| (member.process, id)).collect());
+        assert!(self.checks == members().map(|(&id, member)| (member.check_at, id)).collect());
+        assert!(
+            members()
+                .all(|(_, member)| { member.check_at <= member.last_heard + self.longest_silence })
+        );
+        assert_eq!(self.threads, members().map(|(_, member)| member.threads).sum::<usize>());
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const SILENCE: Duration = Duration::from_secs(60);
+
+    fn process(nonce: u64) -> Process {
+        Process { nonce, number: 7, threads: 2, ..Process::default() }
+    }
+
+    #[expect(clippy::disallowed_methods, reason = "any instant will do")]
+    fn farm() -> (Members, Instant) {
+        (Members::new(SILENCE), Instant::now())
+    }
+
+    #[test]
+    fn joining_again_with_the_same_nonce_changes_nothing() {
+        let (mut members, now) = farm();
+        let (first, is_new) = members.on_join(&process(7), now);
+        assert!(is_new);
+        assert_eq!(members.on_join(&process(7), now), (first, false));
+        let (second, is_new) = members.on_join(&process(8), now);
+        assert!(is_new && second != first);
+        assert_eq!(members.threads(first), (2, 4));
+        members.check();
+    }
+
+    #[test]
+    fn a_sign_of_life_puts_off_the_end_of_a_member() {
+        let (mut members, now) = farm();
+        let (worker, _) = members.on_join(&process(1), now);
+        members.on_sign_of_life(worker, now + SILENCE / 2).unwrap();
+        assert_eq!(members.on_time(now + SILENCE), []);
+        members.check();
+        assert_eq!(members.next_check(), Some(now + SILENCE * 3 / 2));
+        assert_eq!(members.on_time(now + SILENCE * 3 / 2), [worker]);
+        assert!(members.remove(worker) && members.is_empty());
+        assert_eq!(members.on_sign_of_life(worker, now), Err(NoMember(worker)));
+        members.check();
+    }
+
+    #[test]
+    fn a_member_is_known_by_its_process() {
+        let (mut members, now) = farm();
+        let (first, _) = members.on_join(&process(1), now);
+        let (second, _) = members.on_join(&process(2), now);
+        assert_eq!((members.in_process(7), members.in_process(8)), (Some(first), None));
+        members.remove(first);
+        assert_eq!(members.in_process(7), Some(second));
+    }
+}

@@ -1,0 +1,434 @@
+//! The shell of the machine: it hands events to it, with the time, and does what it answers.
+//! Nothing is decided here.
+
+use std::{
+    collections::{BTreeMap, HashMap},
+    future::pending,
+    io,
+    path::PathBuf,
+    sync::{Arc, Mutex, MutexGuard},
+    time::{Duration, Instant},
+};
+
+use rtfarm_core::{
+    prepared::SceneHash,
+    tile::{Area, TileId},
+};
+use rtfarm_job::{FinishedTile, Order, Progress};
+use rtfarm_picture::Picture;
+use rtfarm_proto::{JobId, LeaseName, WorkerId};
+use tokio::sync::{Notify, oneshot, watch};
+use tokio_util::sync::CancellationToken;
+
+use crate::{
+    farm::{Action, Delivery, DeliveryId, Farm, Next, Notice, Verdict},
+    job::Job,
+    members::{NoMember, Process},
+    store::SceneFile,
+    tiles::Tiles,
+    waiting::{Ask, AskId},
+};
+
+/// How a coordinator works.
+#[derive(Debug, Clone)]
+pub struct Config {
+    /// Workers and clients of another version are refused.
+    pub version: String,
+    /// How long a lease lives without progress.
+    pub term: Duration,
+    /// For prepared scenes: a folder that is nobody else's.
+    pub scene_folder: PathBuf,
+    /// For pictures while they are rendered.
+    pub picture_folder: PathBuf,
+}
+
+/// Why an order is not taken.
+#[derive(Debug, thiserror::Error)]
+pub enum SubmitError {
+    /// The scene cannot be written.
+    #[error("cannot write the prepared scene into {folder}: {error}", folder = .0.display(), error = .1)]
+    Scene(PathBuf, io::Error),
+    /// The picture cannot be made.
+    #[error("cannot make the picture's file in {folder}: {error}", folder = .0.display(), error = .1)]
+    Picture(PathBuf, io::Error),
+}
+
+/// The machine and all that its answers concern.
+#[derive(Debug)]
+pub(crate) struct Shell {
+    pub(crate) config: Config,
+    /// Held for a moment: nothing is written and nobody is waited for under it.
+    state: Mutex<State>,
+    /// Told when the machine wants to be woken earlier than it will be.
+    earlier: Notify,
+    /// Cancelled when everybody has gone home: connections are to be closed.
+    pub(crate) stop: CancellationToken,
+}
+
+#[derive(Debug)]
+struct State {
+    farm: Farm,
+    /// Jobs that the machine has not forgotten.
+    jobs: BTreeMap<JobId, Arc<Job>>,
+    /// Questions that the machine has not answered.
+    asks: HashMap<AskId, oneshot::Sender<Result<Next, NoMember>>>,
+    /// Deliveries that the machine has not answered.
+    deliveries: HashMap<DeliveryId, Undecided>,
+    /// The number of the last question or delivery.
+    last_number: u64,
+    /// When the machine will be woken.
+    wakes_at: Option<Instant>,
+}
+
+#[derive(Debug)]
+struct Undecided {
+    /// Taken out when they are stored.
+    pixels: Vec<[f32; 3]>,
+    reply: oneshot::Sender<Verdict>,
+}
+
+/// What is done after the state is unlocked, since it may take a while.
+enum Work {
+    Log(Notice),
+    Publish(Arc<Job>, Progress),
+    Store {
+        job: Arc<Job>,
+        tile: TileId,
+        pixels: Vec<[f32; 3]>,
+    },
+    /// Removes the files of a job that nobody else has in hand.
+    Drop(Arc<Job>),
+}
+
+impl Shell {
+    /// Makes a farm without jobs and workers.
+    pub(crate) fn new(config: Config) -> Self {
+        let state = State {
+            farm: Farm::new(config.term),
+            jobs: BTreeMap::new(),
+            asks: HashMap::new(),
+            deliveries: HashMap::new(),
+            last_number: 0,
+            wakes_at: None,
+        };
+        Self {
+            config,
+            state: Mutex::new(state),
+            earlier: Notify::new(),
+            stop: CancellationToken::new(),
+        }
+    }
+
+    fn state(&self) -> MutexGuard<'_, State> {
+        self.state.lock().expect("deciding never panics")
+    }
+
+    /// Hands an event to the machine and does what it answers.
+    fn tell<T>(&self, event: impl FnOnce(&mut State, Instant) -> (T, Vec<Action>)) -> T {
+        let mut works = Vec::new();
+        let value = {
+            let mut state = self.state();
+            // Under the lock, so that the machine's time never runs backwards.
+            let (value, actions) = event(&mut state, tokio::time::Instant::now().into_std());
+            for action in actions {
+                works.extend(self.act(&mut state, action));
+            }
+            let wake = state.farm.next_wake();
+            if wake.is_some_and(|wake| state.wakes_at.is_none_or(|at| wake < at)) {
+                state.wakes_at = wake;
+                self.earlier.notify_one();
+            }
+            value
+        };
+        for work in works {
+            self.do_work(work);
+        }
+        value
+    }
+
+    fn tell_farm(&self, event: impl FnOnce(&mut Farm, Instant) -> Vec<Action>) {
+        self.tell(|state, now| ((), event(&mut state.farm, now)));
+    }
+
+    /// Does at once what must be done in the order decided, and is quick.
+    fn act(&self, state: &mut State, action: Action) -> Option<Work> {
+        match action {
+            Action::Answer(ask, answer) => {
+                if let Some(reply) = state.asks.remove(&ask) {
+                    // Who asked may have gone; the lease then runs out.
+                    let _ = reply.send(answer);
+                }
+            }
+            Action::Acknowledge(delivery, verdict) => {
+                if let Some(undecided) = state.deliveries.remove(&delivery) {
+                    // The worker may have gone; another delivers the tile again.
+                    let _ = undecided.reply.send(verdict);
+                }
+            }
+            Action::Publish(job, progress) => {
+                let job = state.jobs.get(&job)?;
+                return Some(Work::Publish(Arc::clone(job), progress));
+            }
+            Action::Store(delivery, job, tile) => {
+                let job = Arc::clone(state.jobs.get(&job)?);
+                let pixels = std::mem::take(&mut state.deliveries.get_mut(&delivery)?.pixels);
+                return Some(Work::Store { job, tile, pixels });
+            }
+            Action::Forget(job) => return state.jobs.remove(&job).map(Work::Drop),
+            Action::Log(notice) => return Some(Work::Log(notice)),
+            Action::Stop => self.stop.cancel(),
+        }
+        None
+    }
+
+    fn do_work(&self, work: Work) {
+        match work {
+            Work::Log(notice) => log(notice),
+            Work::Publish(job, progress) => job.publish(progress),
+            Work::Drop(job) => drop(job),
+            Work::Store { job, tile, pixels } => {
+                match job.picture.put(job.grid.area(tile), &pixels) {
+                    Ok(()) => self.tell_farm(|farm, now| farm.on_stored(job.id, tile, now)),
+                    Err(error) => {
+                        self.tell_farm(|farm, _| farm.on_store_failed(job.id, error.to_string()));
+                    }
+                }
+            }
+        }
+    }
+
+    /// Wakes the machine whenever it wants to be woken. Does not return.
+    pub(crate) async fn keep_time(&self) {
+        loop {
+            let wake = {
+                let mut state = self.state();
+                state.wakes_at = state.farm.next_wake();
+                state.wakes_at
+            };
+            let sleep = async {
+                match wake {
+                    Some(wake) => tokio::time::sleep_until(wake.into()).await,
+                    None => pending().await,
+                }
+            };
+            tokio::select! {
+                () = sleep => self.tell_farm(Farm::on_time),
+                () = self.earlier.notified() => {}
+            }
+        }
+    }
+
+    pub(crate) fn join(&self, process: Process) -> WorkerId {
+        self.tell(|state, now| state.farm.on_join(process, now))
+    }
+
+    /// Asks for tiles, and waits for them that long.
+    pub(crate) async fn ask(
+        &self,
+        worker: WorkerId,
+        most: usize,
+        wait: Duration,
+    ) -> Result<Next, NoMember> {
+        let (reply, answer) = oneshot::channel();
+        let id = self.tell(|state, now| {
+            let id = AskId(state.next_number());
+            state.asks.insert(id, reply);
+            (id, state.farm.on_ask(id, Ask { worker, most, until: now + wait }, now))
+        });
+        let _line = Line { shell: self, id };
+        answer.await.expect("every question is answered")
+    }
+
+    pub(crate) fn renew(
+        &self,
+        worker: WorkerId,
+        leases: &[LeaseName],
+    ) -> Result<Vec<LeaseName>, NoMember> {
+        self.tell(|state, now| (state.farm.on_renew(worker, leases, now), Vec::new()))
+    }
+
+    /// A tile of a job that is being rendered, and its pixels' place in the picture.
+    pub(crate) fn tile(&self, job: JobId, number: u32) -> Option<(TileId, Area)> {
+        let state = self.state();
+        let tile = state.farm.tile(job, number)?;
+        Some((tile, state.jobs.get(&job)?.grid.area(tile)))
+    }
+
+    /// Brings the pixels of a tile. The answer comes when they are safe. This writes a file: never
+    /// call it on the async runtime.
+    pub(crate) fn deliver(
+        &self,
+        delivery: Delivery,
+        pixels: Vec<[f32; 3]>,
+    ) -> oneshot::Receiver<Verdict> {
+        let (reply, verdict) = oneshot::channel();
+        self.tell(|state, now| {
+            let id = DeliveryId(state.next_number());
+            state.deliveries.insert(id, Undecided { pixels, reply });
+            ((), state.farm.on_pixels(id, delivery, now))
+        });
+        verdict
+    }
+
+    pub(crate) fn report_senseless_pixels(
+        &self,
+        worker: WorkerId,
+        job: JobId,
+        tile: TileId,
+        reason: &str,
+    ) {
+        self.tell_farm(|farm, _| farm.on_senseless_pixels(worker, job, tile, reason));
+    }
+
+    pub(crate) fn leave(&self, worker: WorkerId, reason: &str) {
+        self.tell_farm(|farm, now| farm.on_leave(worker, reason, now));
+    }
+
+    pub(crate) fn report_process_exit(&self, process: u32, reason: &str) {
+        self.tell_farm(|farm, now| farm.on_process_exit(process, reason, now));
+    }
+
+    /// Takes an order. This writes files: never call it on the async runtime.
+    pub(crate) fn submit(&self, order: Order) -> Result<Arc<Job>, SubmitError> {
+        let Config { scene_folder, picture_folder, .. } = &self.config;
+        let Order { name, prepared, settings, grid, transfer, format } = order;
+        let scene = SceneFile::write(scene_folder, &prepared)
+            .map_err(|error| SubmitError::Scene(scene_folder.clone(), error))?;
+        drop(prepared);
+        let picture = Picture::new_in(picture_folder, settings.size, format, transfer)
+            .map_err(|error| SubmitError::Picture(picture_folder.clone(), error))?;
+
+        let id = self.state().farm.number_job();
+        tracing::info!(
+            job = id.0,
+            scene = name,
+            size = %settings.size,
+            sampling = ?settings.quality.sampling,
+            ?transfer,
+            tiles = grid.count(),
+            side = grid.side(),
+            scene_bytes = scene.byte_count(),
+            "job started"
+        );
+        let progress =
+            watch::Sender::new(Progress { tile_count: grid.count(), ..Progress::default() });
+        let job = Arc::new(Job { id, scene, settings, grid, picture, progress });
+        // Not under the lock: there may be a million.
+        let tiles = Tiles::new(grid);
+        self.tell(|state, now| {
+            state.jobs.insert(id, Arc::clone(&job));
+            ((), state.farm.on_submit(id, tiles, now))
+        });
+        Ok(job)
+    }
+
+    pub(crate) fn cancel(&self, job: JobId) {
+        self.tell_farm(|farm, _| farm.on_cancel(job));
+    }
+
+    pub(crate) fn close(&self) {
+        self.tell_farm(|farm, _| farm.on_close());
+    }
+
+    pub(crate) fn shut_down(&self) {
+        self.tell_farm(Farm::on_shut_down);
+    }
+
+    /// A job that has not been forgotten.
+    pub(crate) fn job(&self, job: JobId) -> Option<Arc<Job>> {
+        self.state().jobs.get(&job).cloned()
+    }
+
+    /// A job that has not been forgotten and has this scene.
+    pub(crate) fn job_with_scene(&self, hash: SceneHash) -> Option<Arc<Job>> {
+        self.state().jobs.values().find(|job| job.scene.hash() == hash).cloned()
+    }
+}
+
+impl State {
+    fn next_number(&mut self) -> u64 {
+        self.last_number += 1;
+        self.last_number
+    }
+}
+
+/// A question on which somebody hangs on. It hangs up when it is dropped.
+struct Line<'a> {
+    shell: &'a Shell,
+    id: AskId,
+}
+
+impl Drop for Line<'_> {
+    fn drop(&mut self) {
+        let mut state = self.shell.state();
+        if state.asks.remove(&self.id).is_some() {
+            state.farm.on_hang_up(self.id);
+        }
+    }
+}
+
+fn log(notice: Notice) {
+    match notice {
+        Notice::Joined(worker, Process { host, number, threads, isa, .. }) => {
+            tracing::info!(
+                worker = worker.0,
+                host,
+                process = number,
+                threads,
+                isa,
+                "worker joined"
+            );
+        }
+        Notice::Gone(worker, reason) => {
+            tracing::info!(worker = worker.0, reason, "worker gone");
+        }
+        Notice::LeaseLost(loss, reason) => tracing::warn!(
+            worker = loss.worker.0,
+            tiles = %list(&loss.tiles),
+            reason,
+            job = loss.lease.job.0,
+            lease = loss.lease.id.0,
+            "lease lost"
+        ),
+        Notice::TileDone { delivery, progress, elapsed } => {
+            let Delivery { worker, tile, seconds, tally, .. } = delivery;
+            let (worker, rays) = (Some(worker.0), tally.rays);
+            FinishedTile { tile, worker, seconds, rays }.log(&progress, elapsed);
+        }
+        Notice::CopiesDiffer { second, first } => tracing::error!(
+            worker = second.worker.0,
+            tile = second.tile.number(),
+            first = %blake3::Hash::from_bytes(first),
+            second = %blake3::Hash::from_bytes(second.hash),
+            "two copies of a tile differ; one of their workers is broken"
+        ),
+        Notice::JobFailed(job, reason) => tracing::warn!(job = job.0, reason, "job failed"),
+        Notice::JobCancelled(job) => tracing::info!(job = job.0, "job cancelled"),
+    }
+}
+
+/// Lists tile numbers in ascending order, runs of neighbours as spans: `3,17-24`.
+fn list(tiles: &[TileId]) -> String {
+    let mut numbers: Vec<u32> = tiles.iter().map(|tile| tile.number()).collect();
+    numbers.sort_unstable();
+    let spans = numbers.chunk_by(|a, b| a + 1 == *b).map(|span| match span {
+        [only] => only.to_string(),
+        span => format!("{}-{}", span[0], span[span.len() - 1]),
+    });
+    spans.collect::<Vec<String>>().join(",")
+}
+
+#[cfg(test)]
+mod tests {
+    use rtfarm_core::tile::{Size, TileGrid};
+
+    use super::*;
+
+    #[test]
+    fn tiles_are_listed_as_spans() {
+        let grid = TileGrid::new(Size::new(160, 160).unwrap(), 16).unwrap();
+        let tiles: Vec<TileId> =
+            [24, 3, 18, 17, 19, 99].iter().map(|&number| grid.tile(number).unwrap()).collect();
+        assert_eq!(list(&tiles), "3,17-19,24,99");
+    }
+}

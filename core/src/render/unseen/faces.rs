@@ -1,0 +1,130 @@
+//! The faces that may be seen in a pixel and that no sample has passed yet.
+
+use glam::DVec3;
+
+use super::{
+    contrast::Surfel,
+    outline::{Corner, Fragment, contains},
+};
+use crate::render::pixel::UNSEEN;
+
+/// The faces that may be seen in a pixel and that no sample has passed yet.
+#[derive(Debug, Default)]
+pub(in crate::render) struct UnseenFaces {
+    faces: Vec<UnseenFace>,
+    /// The corners of all faces.
+    corners: Vec<Corner>,
+    /// How far, channel by channel, the colour of faces that were too many to be looked at may lie
+    /// from that of the pixel; 0 where there were not too many.
+    uncounted_contrast: DVec3,
+}
+
+#[derive(Debug)]
+struct UnseenFace {
+    /// The index of its first corner among those of all faces.
+    first: usize,
+    corner_count: usize,
+    /// The least and the largest row, in pixels, that it may lie between.
+    rows: [f64; 2],
+    /// The share of the pixel that it covers, 0..=1.
+    share: f64,
+    is_front: bool,
+    /// How far its colour may lie from that of the pixel, channel by channel.
+    contrast: DVec3,
+    surfel: Surfel,
+}
+
+impl UnseenFaces {
+    /// Faces that are too many to be looked at: they may cover any share of the pixel.
+    pub(super) fn uncounted(contrast: DVec3) -> Self {
+        Self { uncounted_contrast: contrast, ..Self::default() }
+    }
+
+    /// Whether nothing may hide.
+    pub(in crate::render) fn is_empty(&self) -> bool {
+        self.faces.is_empty() && self.uncounted_contrast == DVec3::ZERO
+    }
+
+    /// Estimates the expected square of what the mean of `count` samples lacks, channel by channel:
+    /// the faces' contrast by their share of the pixel, if all samples missed them. Of a closed
+    /// body only the side that faces the eye is seen, so the two sides are not added.
+    pub(in crate::render) fn variance(&self, count: u32) -> DVec3 {
+        let mut shares = [0.0; 2];
+        let mut lacks = [DVec3::ZERO; 2];
+        for face in &self.faces {
+            let side = usize::from(face.is_front);
+            shares[side] += face.share;
+            lacks[side] += face.share * face.contrast;
+        }
+        let share = shares[0].max(shares[1]);
+        let lack = lacks[0].max(lacks[1]) / share.max(1.0);
+        let n = f64::from(count);
+        lack * lack * power(1.0 - share.min(1.0), count)
+            + self.uncounted_contrast * self.uncounted_contrast * (UNSEEN / (n * n * n))
+    }
+
+    /// Adds the fragment of a face with these corners, which lies between these rows.
+    pub(super) fn add(
+        &mut self,
+        fragment: &Fragment,
+        corners: &[Corner],
+        rows: [f64; 2],
+        contrast: DVec3,
+        surfel: Surfel,
+    ) {
+        let (first, corner_count) = (self.corners.len(), corners.len());
+        self.corners.extend(corners);
+        let &Fragment { share, is_front, .. } = fragment;
+        self.faces.push(UnseenFace {
+            first,
+            corner_count,
+            rows,
+            share,
+            is_front,
+            contrast,
+            surfel,
+        });
+    }
+
+    /// Takes out a face that covers a place on the screen.
+    pub(super) fn remove_at(&mut self, [x, y]: [f64; 2]) -> Option<Surfel> {
+        let passed = self.faces.iter().position(|face| {
+            let [low, high] = face.rows;
+            let corners = &self.corners[face.first..face.first + face.corner_count];
+            y >= low && y <= high && contains(corners, [x, y])
+        });
+        passed.map(|face| self.faces.remove(face).surfel)
+    }
+
+    /// Lowers each face's contrast to at most what `contrast` gives for it.
+    pub(super) fn limit_contrasts(&mut self, contrast: impl Fn(&Surfel) -> DVec3) {
+        for face in &mut self.faces {
+            face.contrast = face.contrast.min(contrast(&face.surfel));
+        }
+    }
+}
+
+/// Raises `base` to a whole power by squaring.
+fn power(base: f64, exponent: u32) -> f64 {
+    let (mut product, mut square, mut left) = (1.0, base, exponent);
+    while left > 0 {
+        if left & 1 == 1 {
+            product *= square;
+        }
+        square *= square;
+        left >>= 1;
+    }
+    product
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_power_is_a_product() {
+        assert_eq!(power(0.5, 0), 1.0);
+        assert_eq!(power(0.5, 13), 1.0 / 8192.0);
+        assert_eq!(power(0.0, 8), 0.0);
+    }
+}

@@ -1,0 +1,283 @@
+//! What may be seen in a pixel though none of its samples has met it: faces in the beam of all rays
+//! through the pixel.
+//!
+//! The search goes through the hierarchy in blocks of pixels. A block has a [`screen::Beam`], and
+//! [`frustum`] collects the faces in it: boxes are filtered with a margin for rounding, then a
+//! face's own [`outline`] on the screen decides. So what a pixel learns depends neither on the tree
+//! nor on the block. The [`judge`] cuts the outlines to the pixel and keeps those that no sample
+//! has met or passed, and whose colour may lie far enough from what was seen ([`contrast`]). They
+//! are the pixel's [`UnseenFaces`], and tell how much its mean may lack; later samples take them
+//! out one by one.
+
+mod contrast;
+mod faces;
+mod frustum;
+mod judge;
+mod outline;
+mod screen;
+
+pub(super) use self::{faces::UnseenFaces, judge::FirstSamples};
+
+use glam::DVec3;
+
+use self::{
+    frustum::FrustumSearch,
+    judge::Judge,
+    screen::{Beam, Rectangle, Screen},
+};
+use crate::{
+    prepared::layout::View,
+    tile::{Area, Size},
+    trace::ray::Hit,
+};
+
+/// Sides, in pixels, of blocks that are searched in one go, and how many faces may be in their
+/// beams: a block with more is cut into those of the next size. A pixel with more is crowded.
+const BLOCKS: [(u32, usize); 3] = [(8, 128), (2, 64), (1, MOST_FACES)];
+
+/// The most faces that a pixel is searched for.
+const MOST_FACES: usize = 128;
+
+/// In a crowded pixel faces count that stand this many pixels' widths before all that its samples
+/// met.
+const CROWDED_CLEARANCE: f64 = 8.0;
+
+/// A face counts in a pixel if it begins at most this many times as deep as the deepest of what the
+/// pixel's samples met.
+const DEPTH_RATIO: f64 = 1.25;
+
+/// The search for what pixels may hide.
+pub(super) struct UnseenSearch<'a> {
+    view: &'a View<'a>,
+    screen: Screen,
+    frustum_search: FrustumSearch,
+    judge: Judge<'a>,
+}
+
+impl<'a> UnseenSearch<'a> {
+    /// Prepares the search in a picture with the standard error `error`, above 0, that shows plain
+    /// colours if it is `flat`. It is `None` where the screen is seen edge-on, so that a pixel has
+    /// no beam.
+    pub(super) fn new(view: &'a View<'a>, size: Size, flat: bool, error: f64) -> Option<Self> {
+        let screen = Screen::new(&view.header.camera, size)?;
+        let judge = Judge::new(view, flat, error);
+        Some(Self { view, screen, frustum_search: FrustumSearch::default(), judge })
+    }
+
+    /// Finds what may hide in the pixels of an area. `first_samples` tells what a pixel's samples
+    /// saw, and `on_found` gets each pixel that may hide something.
+    pub(super) fn search<'s>(
+        &mut self,
+        area: Area,
+        first_samples: &impl Fn(u32, u32) -> FirstSamples<'s>,
+        on_found: &mut impl FnMut(u32, u32, UnseenFaces),
+    ) {
+        self.search_blocks(area, &BLOCKS, first_samples, on_found);
+    }
+
+    fn search_blocks<'s>(
+        &mut self,
+        area: Area,
+        sizes: &[(u32, usize)],
+        first_samples: &impl Fn(u32, u32) -> FirstSamples<'s>,
+        on_found: &mut impl FnMut(u32, u32, UnseenFaces),
+    ) {
+        let Some((&(side, most), smaller)) = sizes.split_first() else {
+            let (x, y) = (area.x0(), area.y0());
+            return self.search_crowded(x, y, &first_samples(x, y), on_found);
+        };
+        for block in area.blocks(side) {
+            let deepest = block
+                .pixels()
+                .map(|(x, y)| self.deepest(x, y, first_samples(x, y).hits))
+                .fold(0.0, f64::max);
+            let beam = Beam { block: Rectangle::of_block(block), deepest };
+            if !self.frustum_search.collect(self.view, &self.screen, &beam, most) {
+                self.search_blocks(block, smaller, first_samples, on_found);
+                continue;
+            }
+            for (x, y) in block.pixels() {
+                let first = first_samples(x, y);
+                let unseen = self.find_unseen(x, y, &first, self.deepest(x, y, first.hits));
+                if !unseen.is_empty() {
+                    on_found(x, y, unseen);
+                }
+            }
+        }
+    }
+
+    /// Searches a pixel with too many faces: only those count that stand before all that was seen.
+    /// If these are too many as well, nobody knows which share of the pixel they cover.
+    fn search_crowded(
+        &mut self,
+        x: u32,
+        y: u32,
+        first: &FirstSamples<'_>,
+        on_found: &mut impl FnMut(u32, u32, UnseenFaces),
+    ) {
+        let nearest = first.hits.iter().map(|hit| hit.t).fold(f64::INFINITY, f64::min);
+        let middle = self.screen.pixel_direction(x, y).length();
+        let clearance = 1.0 - CROWDED_CLEARANCE * self.screen.pixel_side() / middle;
+        let deepest = nearest / middle * clearance;
+        let beam = Beam { block: Rectangle::of_pixel(x, y), deepest };
+        let unseen = if self.frustum_search.collect(self.view, &self.screen, &beam, MOST_FACES) {
+            self.find_unseen(x, y, first, deepest)
+        } else {
+            UnseenFaces::uncounted(first.mean.max(DVec3::ONE - first.mean))
+        };
+        if !unseen.is_empty() {
+            on_found(x, y, unseen);
+        }
+    }
+
+    /// The depth up to which faces count in a pixel.
+    fn deepest(&self, x: u32, y: u32, hits: &[Hit]) -> f64 {
+        let farthest = hits.iter().map(|hit| hit.t).fold(0.0, f64::max);
+        DEPTH_RATIO * farthest / self.screen.pixel_direction(x, y).length()
+    }
+
+    fn find_unseen(
+        &mut self,
+        x: u32,
+        y: u32,
+        first: &FirstSamples<'_>,
+        deepest: f64,
+    ) -> UnseenFaces {
+        let outlines = &self.frustum_search.outlines;
+        self.judge.find_unseen(&self.screen, outlines, (x, y), first, deepest)
+    }
+
+    /// Takes out of what a pixel may hide what its next samples, at these places in pixels on the
+    /// screen, tell of it; with them it has `count` samples.
+    pub(super) fn note_samples(
+        &self,
+        unseen: &mut UnseenFaces,
+        places: impl Iterator<Item = [f64; 2]>,
+        count: u32,
+    ) {
+        self.judge.note_samples(&self.screen, unseen, places, count);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::fmt::Write;
+
+    use super::{
+        outline::{Clipper, Fragment, Outline, Outlines},
+        *,
+    };
+    use crate::{
+        language::reader::read_scene,
+        prepare::prepare,
+        prepared::{PreparedBytes, PreparedScene},
+    };
+
+    /// Triangles, quadrangles, boxes and specks all around the eye.
+    fn clutter() -> PreparedScene<PreparedBytes> {
+        let mut text = "viewport origin 0.1 0.2 0.3 topleft -1 1 -1 bottomleft -1 -1 -1.2
+            topright 1 1 -0.9 endviewport materials entry name a endentry endmaterials geometry "
+            .to_owned();
+        let mut state = 1_u32;
+        let mut random = || {
+            state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+            f64::from(state >> 8) / f64::from(1 << 24)
+        };
+        for k in 0..400 {
+            let mut place = || [0; 3].map(|_| 6.0 * random() - 3.0);
+            let ([x, y, z], [u, v, w]) = (place(), place().map(|c| 0.2 * c));
+            let corners = format!("vertex {x} {y} {z} vertex {} {y} {}", x + u, z + w);
+            match k % 4 {
+                0 => write!(
+                    text,
+                    "triangle {corners} vertex {x} {} {z} material a endtriangle ",
+                    y + v
+                ),
+                1 => write!(
+                    text,
+                    "quadrangle {corners} vertex {} {} {} vertex {x} {} {z} material a
+                     endquadrangle ",
+                    x + u,
+                    y + v,
+                    z + w,
+                    y + v
+                ),
+                2 => write!(
+                    text,
+                    "union parallelepiped {corners} vertex {x} {} {z} vertex {} {y} {}
+                     material a endparallelepiped sphere coords {x} {y} {z} radius 0.01 material a
+                     endsphere endunion ",
+                    y + v,
+                    x - w,
+                    z + u
+                ),
+                _ => write!(text, "sphere coords {x} {y} {z} radius 0.01 material a endsphere "),
+            }
+            .unwrap();
+        }
+        let nothing = |_: &str| Err(std::io::ErrorKind::NotFound.into());
+        let scene = read_scene((text + "endgeometry").as_bytes(), &nothing).scene.unwrap();
+        PreparedScene::open(prepare(&scene).unwrap()).unwrap()
+    }
+
+    #[test]
+    fn beams_meet_the_faces_that_they_meet_without_the_hierarchy() {
+        let scene = clutter();
+        let view = scene.view();
+        let size = Size::new(40, 30).unwrap();
+        let screen = Screen::new(&view.header.camera, size).unwrap();
+        let ranks = |outlines: &Outlines| {
+            let mut ranks: Vec<u32> = outlines.as_slice().iter().map(|face| face.rank).collect();
+            ranks.sort_unstable();
+            ranks
+        };
+        let mut search = FrustumSearch::default();
+        let mut total = 0;
+        for block in [1, 2, 8].into_iter().flat_map(|side| Area::whole(size).blocks(side)) {
+            for deepest in [0.7, 2.0, f64::INFINITY] {
+                let beam = Beam { block: Rectangle::of_block(block), deepest };
+                assert!(search.collect(&view, &screen, &beam, usize::MAX));
+                let mut all = Outlines::default();
+                view.items.iter().for_each(|&item| all.add_item(&view, &screen, item, &beam));
+                assert_eq!(ranks(&search.outlines), ranks(&all), "{block:?}");
+                total += all.as_slice().len();
+            }
+        }
+        eprintln!("{total} faces in all beams");
+        assert!(total > 1000);
+    }
+
+    #[test]
+    fn fragments_of_a_face_in_all_pixels_are_the_face() {
+        let scene = clutter();
+        let view = scene.view();
+        let size = Size::new(40, 30).unwrap();
+        let screen = Screen::new(&view.header.camera, size).unwrap();
+        let frame = Area::whole(size);
+        let beam = Beam { block: Rectangle::of_block(frame), deepest: f64::INFINITY };
+        let mut search = FrustumSearch::default();
+        assert!(search.collect(&view, &screen, &beam, usize::MAX));
+        let inside = |&&Outline { bounds: Rectangle { low, high }, .. }: &&Outline| {
+            low[0] > 0.0 && low[1] > 0.0 && high[0] < 40.0 && high[1] < 30.0
+        };
+        let faces: Vec<&Outline> = search.outlines.as_slice().iter().filter(inside).collect();
+        assert!(faces.len() > 20);
+        let mut clipper = Clipper::default();
+        for face in faces {
+            let corners = search.outlines.corners_of(face);
+            let mut area = 0.0;
+            for (k, a) in corners.iter().enumerate() {
+                let b = &corners[(k + 1) % corners.len()];
+                area += (a[0] * b[1] - a[1] * b[0]) / 2.0;
+            }
+            let shares = frame.pixels().filter_map(|(x, y)| {
+                let pixel = Rectangle::of_pixel(x, y);
+                let overlaps = face.bounds.overlaps(&pixel);
+                let cut = || Fragment::new(corners, &face.bounds, &pixel, &mut clipper);
+                overlaps.then(cut)?.map(|fragment| fragment.share)
+            });
+            let sum: f64 = shares.sum();
+            assert!((sum - area.abs()).abs() < 1e-9, "{sum} of {area}");
+        }
+    }
+}

@@ -1,0 +1,5 @@
+//! What several files of tests need.
+
+pub(crate) mod judge;
+pub(crate) mod parts;
+pub(crate) mod studio;

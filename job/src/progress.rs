@@ -1,0 +1,31 @@
+//! How far a job is.
+
+use std::time::Duration;
+
+use rtfarm_core::render::Tally;
+
+/// How far a job is.
+#[derive(Debug, Clone, Default)]
+pub struct Progress {
+    /// Tiles in the picture.
+    pub tiles_done: u32,
+    /// Tiles of the picture.
+    pub tile_count: u32,
+    /// What the tiles in the picture took.
+    pub tally: Tally,
+    /// Workers that brought some of them; none where the process renders by itself.
+    pub worker_count: u32,
+    /// Tiles of which two copies differed.
+    pub differing_tiles: u32,
+    /// How it ended, once it has.
+    pub outcome: Option<Outcome>,
+}
+
+/// How a job ended.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Outcome {
+    /// Every tile is in the picture, after that time.
+    Finished(Duration),
+    /// It will never be.
+    Failed(String),
+}

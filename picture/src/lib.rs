@@ -1,0 +1,10 @@
+//! A picture in a file: tiles are put into it in any order and from any thread, then it is encoded
+//! as a PNG or an `OpenEXR`, band by band, so that its size is not limited by memory.
+
+mod exr;
+mod format;
+mod picture;
+mod png;
+
+pub use format::PictureFormat;
+pub use picture::{Picture, PutError, check_pixels};

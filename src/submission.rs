@@ -1,0 +1,585 @@
+//! A client's side of one job: it submits a scene, watches the job, fetches the picture and has
+//! the farm forget the job. Decisions alone: what happens comes in as events with the time, what
+//! is to be done goes out as [`Action`]s, and nothing here waits.
+
+use std::{
+    collections::VecDeque,
+    fmt,
+    time::{Duration, Instant},
+};
+
+use anyhow::anyhow;
+use rtfarm_core::{render::Tally, tile::Size};
+use rtfarm_proto::{Address, JobId};
+
+use crate::failure::Failure;
+
+/// What the shell is to do. All but [`Action::TellReport`], [`Action::Show`] and
+/// [`Action::WarnOfDifferingTiles`] end what was being done before.
+#[derive(Debug)]
+pub(crate) enum Action {
+    /// Reach the coordinator.
+    Connect,
+    /// Send the order, the scene and its files.
+    Submit,
+    /// Tell the user what the coordinator says of the scene.
+    TellReport(String),
+    /// Follow a job from event to event.
+    Watch(JobId),
+    /// Show the user how far the job is.
+    Show(JobState),
+    /// Warn the user that so many tiles had a second copy that differed from the first.
+    WarnOfDifferingTiles(u32),
+    /// Bring the picture and write it.
+    Fetch(JobId),
+    /// Have the farm forget the job.
+    Cancel(JobId),
+    /// End; nothing comes after this.
+    End(Result<Finished, Failure>),
+}
+
+/// What came of submitting a scene.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct Submitted {
+    pub(crate) outcome: SubmitOutcome,
+    /// What there is to tell the scene's author.
+    pub(crate) report: String,
+}
+
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) enum SubmitOutcome {
+    Accepted {
+        job: JobId,
+        size: Size,
+    },
+    /// Why not; the report says it if this is empty.
+    Refused(String),
+}
+
+/// How far a job is.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct JobState {
+    pub(crate) tiles_done: u32,
+    pub(crate) tile_count: u32,
+    pub(crate) tally: Tally,
+    /// Workers that have delivered something.
+    pub(crate) worker_count: u32,
+    /// Tiles with a second copy that differed from the first.
+    pub(crate) differing_tiles: u32,
+    pub(crate) end: Option<JobEnd>,
+}
+
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) enum JobEnd {
+    /// The time from the job's start to its last tile.
+    Finished(Duration),
+    /// Why there is no picture.
+    Failed(String),
+}
+
+/// What there is to say of a picture that was written.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct Finished {
+    pub(crate) size: Size,
+    pub(crate) tally: Tally,
+    pub(crate) worker_count: u32,
+    pub(crate) rendering: Duration,
+}
+
+/// What goes wrong on the way.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) enum Trouble {
+    /// Nobody answers at the address.
+    Connect(Address, String),
+    /// The coordinator says why it does not do what was asked.
+    Call(String),
+    /// A deadline has passed.
+    Late,
+    /// A stream has ended before its end.
+    Gone,
+    /// An answer cannot be understood.
+    Nonsense(String),
+    /// A file on this machine cannot be read or written.
+    File(String),
+}
+
+impl fmt::Display for Trouble {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Connect(address, reason) => {
+                write!(f, "no coordinator answers at {address}: {reason}")
+            }
+            Self::Call(reason) => write!(f, "the coordinator says: {reason}"),
+            Self::Late => f.write_str("the coordinator does not answer"),
+            Self::Gone => f.write_str("the coordinator is gone"),
+            Self::Nonsense(reason) => {
+                write!(f, "the coordinator's answer makes no sense: {reason}")
+            }
+            Self::File(reason) => f.write_str(reason),
+        }
+    }
+}
+
+/// The longest that a short question may wait for its answer.
+const DEADLINE: Duration = Duration::from_secs(15);
+
+/// A scene may be large and take long to prepare.
+const SUBMIT_DEADLINE: Duration = Duration::from_secs(1800);
+
+/// Encoding a large picture takes a while.
+const IMAGE_DEADLINE: Duration = Duration::from_secs(600);
+
+/// The longest that a piece of the picture may be on its way.
+const CHUNK_DEADLINE: Duration = Duration::from_secs(30);
+
+/// A client's side of one job.
+#[derive(Debug)]
+pub(crate) struct Submission {
+    /// What the scene is called in messages.
+    scene: String,
+    stage: Stage,
+    /// When what is being done must have come further.
+    deadline: Option<Instant>,
+    actions: VecDeque<Action>,
+}
+
+#[derive(Debug)]
+enum Stage {
+    Connecting,
+    Submitting,
+    Watching {
+        job: JobId,
+        size: Size,
+    },
+    Fetching {
+        job: JobId,
+        finished: Finished,
+    },
+    /// The job is being forgotten; then the submission ends so.
+    Cancelling {
+        end: Result<Finished, Failure>,
+    },
+    Ended,
+}
+
+impl Submission {
+    /// A submission that begins to look for the coordinator.
+    pub(crate) fn new(scene: String, now: Instant) -> Self {
+        let mut submission =
+            Self { scene, stage: Stage::Ended, deadline: None, actions: VecDeque::new() };
+        submission.enter(Stage::Connecting, Action::Connect, now + DEADLINE);
+        submission
+    }
+
+    /// What is to be done next, if there is anything. Ask after every event until there is not.
+    pub(crate) fn next_action(&mut self) -> Option<Action> {
+        self.actions.pop_front()
+    }
+
+    /// When to call [`Submission::on_tick`] if nothing happens before.
+    pub(crate) fn wake_at(&self) -> Option<Instant> {
+        self.deadline
+    }
+
+    /// Event: the coordinator was reached.
+    pub(crate) fn on_connected(&mut self, now: Instant) {
+        if let Stage::Connecting = self.stage {
+            self.enter(Stage::Submitting, Action::Submit, now + SUBMIT_DEADLINE);
+        }
+    }
+
+    /// Event: the coordinator has looked at the scene.
+    pub(crate) fn on_submitted(&mut self, submitted: Submitted, now: Instant) {
+        let Stage::Submitting = self.stage else { return };
+        self.actions.push_back(Action::TellReport(submitted.report));
+        match submitted.outcome {
+            SubmitOutcome::Accepted { job, size } => {
+                self.enter(Stage::Watching { job, size }, Action::Watch(job), now + DEADLINE);
+            }
+            SubmitOutcome::Refused(reason) if reason.is_empty() => self.end(Err(Failure::Told)),
+            SubmitOutcome::Refused(reason) => {
+                let scene = &self.scene;
+                let error = anyhow!("the farm cannot render {scene}: {reason}");
+                self.end(Err(Failure::Input(error)));
+            }
+        }
+    }
+
+    /// Event: the coordinator will tell of the job from now on.
+    pub(crate) fn on_watching(&mut self) {
+        if let Stage::Watching { .. } = self.stage {
+            // A tile may take any time, and a dead connection is noticed by its keep-alive.
+            self.deadline = None;
+        }
+    }
+
+    /// Event: the job has come further.
+    pub(crate) fn on_job_state(&mut self, state: JobState, now: Instant) {
+        let Stage::Watching { job, size } = self.stage else { return };
+        self.actions.push_back(Action::Show(state.clone()));
+        match state.end {
+            None => {}
+            Some(JobEnd::Finished(rendering)) => {
+                if state.differing_tiles > 0 {
+                    self.actions.push_back(Action::WarnOfDifferingTiles(state.differing_tiles));
+                }
+                let JobState { tally, worker_count, .. } = state;
+                let finished = Finished { size, tally, worker_count, rendering };
+                let fetching = Stage::Fetching { job, finished };
+                self.enter(fetching, Action::Fetch(job), now + IMAGE_DEADLINE);
+            }
+            Some(JobEnd::Failed(reason)) => {
+                self.cancel(job, Err(Failure::Other(anyhow!("the job failed: {reason}"))), now);
+            }
+        }
+    }
+
+    /// Event: a piece of the picture is here.
+    pub(crate) fn on_chunk(&mut self) {
+        if let Stage::Fetching { .. } = self.stage {
+            // Writing it is not the coordinator's affair.
+            self.deadline = None;
+        }
+    }
+
+    /// Event: the next piece of the picture is waited for.
+    pub(crate) fn on_chunk_awaited(&mut self, now: Instant) {
+        if let Stage::Fetching { .. } = self.stage {
+            self.deadline = Some(now + CHUNK_DEADLINE);
+        }
+    }
+
+    /// Event: the whole picture was written.
+    pub(crate) fn on_fetched(&mut self, now: Instant) {
+        if let Stage::Fetching { job, finished } = &self.stage {
+            self.cancel(*job, Ok(finished.clone()), now);
+        }
+    }
+
+    /// Event: the farm has forgotten the job.
+    pub(crate) fn on_cancelled(&mut self) {
+        if let Stage::Cancelling { .. } = self.stage {
+            self.end_as_cancelled();
+        }
+    }
+
+    /// Event: what is being done has failed.
+    pub(crate) fn on_trouble(&mut self, trouble: Trouble, now: Instant) {
+        match self.stage {
+            Stage::Cancelling { .. } => self.end_as_cancelled(),
+            _ => self.give_up(Failure::Other(anyhow::Error::msg(trouble)), now),
+        }
+    }
+
+    /// Event: time passes.
+    pub(crate) fn on_tick(&mut self, now: Instant) {
+        if self.deadline.is_some_and(|deadline| deadline <= now) {
+            self.on_trouble(Trouble::Late, now);
+        }
+    }
+
+    /// Event: somebody wants this client to end.
+    pub(crate) fn on_stop(&mut self, now: Instant) {
+        match self.stage {
+            // What was reached is told, and the farm is already being told to forget the job.
+            Stage::Cancelling { .. } => {}
+            _ => self.give_up(Failure::Interrupted, now),
+        }
+    }
+
+    fn enter(&mut self, stage: Stage, action: Action, deadline: Instant) {
+        self.stage = stage;
+        self.deadline = Some(deadline);
+        self.actions.push_back(action);
+    }
+
+    fn give_up(&mut self, failure: Failure, now: Instant) {
+        match self.stage {
+            Stage::Connecting | Stage::Submitting => self.end(Err(failure)),
+            Stage::Watching { job, .. } | Stage::Fetching { job, .. } => {
+                self.cancel(job, Err(failure), now);
+            }
+            Stage::Cancelling { .. } | Stage::Ended => {}
+        }
+    }
+
+    fn cancel(&mut self, job: JobId, end: Result<Finished, Failure>, now: Instant) {
+        self.enter(Stage::Cancelling { end }, Action::Cancel(job), now + DEADLINE);
+    }
+
+    fn end_as_cancelled(&mut self) {
+        if let Stage::Cancelling { end } = std::mem::replace(&mut self.stage, Stage::Ended) {
+            self.end(end);
+        }
+    }
+
+    fn end(&mut self, end: Result<Finished, Failure>) {
+        self.stage = Stage::Ended;
+        self.deadline = None;
+        self.actions.push_back(Action::End(end));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const JOB: JobId = JobId(7);
+    const SECOND: Duration = Duration::from_secs(1);
+
+    #[expect(clippy::disallowed_methods, reason = "any instant will do")]
+    fn start() -> Instant {
+        Instant::now()
+    }
+
+    fn size() -> Size {
+        Size::new(4, 3).unwrap()
+    }
+
+    fn accepted() -> Submitted {
+        let outcome = SubmitOutcome::Accepted { job: JOB, size: size() };
+        Submitted { outcome, report: "a warning".to_owned() }
+    }
+
+    fn state(end: Option<JobEnd>) -> JobState {
+        let (tiles_done, tile_count) = if end.is_some() { (9, 9) } else { (4, 9) };
+        let tally = Tally { rays: 5, ..Tally::default() };
+        JobState { tiles_done, tile_count, tally, worker_count: 2, differing_tiles: 0, end }
+    }
+
+    fn finished() -> JobEnd {
+        JobEnd::Finished(SECOND)
+    }
+
+    /// A submission on a clock that only the test moves.
+    struct Bench {
+        submission: Submission,
+        now: Instant,
+    }
+
+    impl Bench {
+        fn connecting() -> Self {
+            let now = start();
+            Self { submission: Submission::new("scene.rt".to_owned(), now), now }
+        }
+
+        fn submitting() -> Self {
+            let mut bench = Self::connecting();
+            bench.submission.on_connected(bench.now);
+            bench
+        }
+
+        fn watching() -> Self {
+            let mut bench = Self::submitting();
+            bench.submission.on_submitted(accepted(), bench.now);
+            bench.submission.on_watching();
+            bench
+        }
+
+        fn fetching() -> Self {
+            let mut bench = Self::watching();
+            bench.submission.on_job_state(state(Some(finished())), bench.now);
+            bench
+        }
+
+        /// The names of the actions since the last time, and how the submission ended.
+        fn actions(&mut self) -> (Vec<String>, Option<Result<Finished, Failure>>) {
+            let mut names = Vec::new();
+            let mut end = None;
+            while let Some(action) = self.submission.next_action() {
+                assert!(end.is_none(), "nothing comes after the end, but {action:?}");
+                match action {
+                    Action::End(as_told) => end = Some(as_told),
+                    Action::Show(state) => names.push(format!("Show({})", state.tiles_done)),
+                    action => names.push(format!("{action:?}")),
+                }
+            }
+            assert!(end.is_none() || self.submission.wake_at().is_none(), "an end is no wait");
+            (names, end)
+        }
+
+        fn check_actions(&mut self, expected: &[&str]) {
+            let (names, end) = self.actions();
+            assert_eq!(names, expected);
+            assert!(end.is_none(), "{end:?}");
+        }
+
+        /// Checks that the last actions are these and a failure with that code and message.
+        fn check_failed(&mut self, expected: &[&str], code: u8, message: &str) {
+            let (names, end) = self.actions();
+            assert!(names.ends_with(&expected.iter().map(ToString::to_string).collect::<Vec<_>>()));
+            let failure = end.expect("an end").expect_err("a failure");
+            assert_eq!((failure.exit_code(), failure.to_string().as_str()), (code, message));
+        }
+
+        /// Lets time pass until the submission wants to be woken; answers with how long it slept.
+        fn sleep(&mut self) -> Duration {
+            let wake = self.submission.wake_at().expect("something to wait for");
+            let slept = wake - self.now;
+            self.submission.on_tick(self.now + slept.mul_f64(0.999));
+            assert_eq!(self.submission.wake_at(), Some(wake), "nothing happens before");
+            self.now = wake;
+            self.submission.on_tick(self.now);
+            slept
+        }
+    }
+
+    #[test]
+    fn a_picture_is_submitted_watched_fetched_and_its_job_forgotten() {
+        let mut bench = Bench::connecting();
+        bench.check_actions(&["Connect"]);
+        bench.submission.on_connected(bench.now);
+        bench.check_actions(&["Submit"]);
+        bench.submission.on_submitted(accepted(), bench.now);
+        bench.check_actions(&[r#"TellReport("a warning")"#, "Watch(JobId(7))"]);
+        bench.submission.on_watching();
+        bench.submission.on_job_state(state(None), bench.now);
+        bench.check_actions(&["Show(4)"]);
+        bench.submission.on_job_state(state(Some(finished())), bench.now);
+        bench.check_actions(&["Show(9)", "Fetch(JobId(7))"]);
+        bench.submission.on_chunk_awaited(bench.now);
+        bench.submission.on_chunk();
+        bench.submission.on_fetched(bench.now);
+        bench.check_actions(&["Cancel(JobId(7))"]);
+        bench.submission.on_cancelled();
+        let (names, end) = bench.actions();
+        assert_eq!(names, [""; 0]);
+        let tally = Tally { rays: 5, ..Tally::default() };
+        let expected = Finished { size: size(), tally, worker_count: 2, rendering: SECOND };
+        assert_eq!(end.expect("an end").expect("a picture"), expected);
+    }
+
+    #[test]
+    fn a_refused_scene_is_bad_input() {
+        let refused = |reason: &str| Submitted {
+            outcome: SubmitOutcome::Refused(reason.to_owned()),
+            report: "3:1: an error".to_owned(),
+        };
+        let mut bench = Bench::submitting();
+        bench.submission.on_submitted(refused("it has no viewport"), bench.now);
+        let told = r#"TellReport("3:1: an error")"#;
+        bench.check_failed(&[told], 2, "the farm cannot render scene.rt: it has no viewport");
+        let mut bench = Bench::submitting();
+        bench.submission.on_submitted(refused(""), bench.now);
+        bench.check_failed(&[told], 2, "");
+    }
+
+    #[test]
+    fn a_failed_job_is_forgotten_and_its_reason_told() {
+        let mut bench = Bench::watching();
+        let failed = JobEnd::Failed("the coordinator was stopped".to_owned());
+        bench.submission.on_job_state(state(Some(failed)), bench.now);
+        bench.submission.on_cancelled();
+        let message = "the job failed: the coordinator was stopped";
+        bench.check_failed(&["Cancel(JobId(7))"], 1, message);
+    }
+
+    #[test]
+    fn lost_events_end_the_job() {
+        let mut bench = Bench::watching();
+        bench.submission.on_job_state(state(None), bench.now);
+        bench.submission.on_trouble(Trouble::Gone, bench.now);
+        bench.submission.on_trouble(Trouble::Call("not heard".to_owned()), bench.now);
+        bench.check_failed(&["Show(4)", "Cancel(JobId(7))"], 1, "the coordinator is gone");
+    }
+
+    #[test]
+    fn differing_tiles_are_warned_of_once_the_picture_is_finished() {
+        let mut bench = Bench::watching();
+        bench.actions();
+        bench.submission.on_job_state(JobState { differing_tiles: 3, ..state(None) }, bench.now);
+        bench.check_actions(&["Show(4)"]);
+        let last = JobState { differing_tiles: 3, ..state(Some(finished())) };
+        bench.submission.on_job_state(last, bench.now);
+        bench.check_actions(&["Show(9)", "WarnOfDifferingTiles(3)", "Fetch(JobId(7))"]);
+    }
+
+    #[test]
+    fn before_there_is_a_job_an_interruption_ends_at_once() {
+        for (mut bench, last) in [(Bench::connecting(), "Connect"), (Bench::submitting(), "Submit")]
+        {
+            bench.submission.on_stop(bench.now);
+            bench.check_failed(&[last], 130, "interrupted");
+        }
+    }
+
+    #[test]
+    fn an_interrupted_job_is_forgotten() {
+        for mut bench in [Bench::watching(), Bench::fetching()] {
+            bench.submission.on_stop(bench.now);
+            bench.submission.on_stop(bench.now);
+            bench.submission.on_cancelled();
+            bench.check_failed(&["Cancel(JobId(7))"], 130, "interrupted");
+        }
+    }
+
+    #[test]
+    fn a_picture_that_was_written_is_a_success_whatever_comes_after() {
+        let mut bench = Bench::fetching();
+        bench.submission.on_fetched(bench.now);
+        bench.submission.on_stop(bench.now);
+        assert_eq!(bench.sleep(), DEADLINE);
+        let (_, end) = bench.actions();
+        end.expect("an end").expect("a picture");
+    }
+
+    #[test]
+    fn a_silent_coordinator_is_waited_for_so_long_and_no_longer() {
+        let message = "the coordinator does not answer";
+        for (mut bench, deadline) in
+            [(Bench::connecting(), DEADLINE), (Bench::submitting(), SUBMIT_DEADLINE)]
+        {
+            assert_eq!(bench.sleep(), deadline);
+            bench.check_failed(&[], 1, message);
+        }
+        let mut opening = Bench::submitting();
+        opening.submission.on_submitted(accepted(), opening.now);
+        let mut reading = Bench::fetching();
+        reading.submission.on_chunk_awaited(reading.now);
+        for (mut bench, deadline) in
+            [(opening, DEADLINE), (Bench::fetching(), IMAGE_DEADLINE), (reading, CHUNK_DEADLINE)]
+        {
+            assert_eq!(bench.sleep(), deadline);
+            assert_eq!(bench.sleep(), DEADLINE, "nor for its farewell");
+            bench.check_failed(&["Cancel(JobId(7))"], 1, message);
+        }
+    }
+
+    #[test]
+    fn neither_rendering_nor_writing_has_a_deadline() {
+        let mut bench = Bench::watching();
+        assert_eq!(bench.submission.wake_at(), None);
+        bench = Bench::fetching();
+        bench.submission.on_chunk_awaited(bench.now);
+        bench.submission.on_chunk();
+        assert_eq!(bench.submission.wake_at(), None);
+    }
+
+    #[test]
+    fn a_full_disk_ends_the_job_with_the_reason() {
+        let mut bench = Bench::fetching();
+        let reason = "cannot write out.png: No space left on device".to_owned();
+        bench.submission.on_trouble(Trouble::File(reason.clone()), bench.now);
+        bench.submission.on_cancelled();
+        bench.check_failed(&["Cancel(JobId(7))"], 1, &reason);
+    }
+
+    #[test]
+    fn what_comes_after_its_time_changes_nothing() {
+        let mut bench = Bench::watching();
+        bench.submission.on_stop(bench.now);
+        bench.actions();
+        bench.submission.on_connected(bench.now);
+        bench.submission.on_submitted(accepted(), bench.now);
+        bench.submission.on_job_state(state(Some(finished())), bench.now);
+        bench.submission.on_fetched(bench.now);
+        bench.check_actions(&[]);
+        bench.submission.on_cancelled();
+        bench.actions();
+        bench.submission.on_cancelled();
+        bench.submission.on_stop(bench.now);
+        bench.submission.on_trouble(Trouble::Gone, bench.now);
+        bench.submission.on_tick(bench.now + SUBMIT_DEADLINE);
+        bench.check_actions(&[]);
+    }
+}

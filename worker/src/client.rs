@@ -1,0 +1,134 @@
+//! Calls over gRPC: a question goes out as a wire message, its answer comes back parsed. What a
+//! `Status` says of the coordinator is read here and nowhere else.
+
+use std::{error::Error, sync::Arc, time::Duration};
+
+use rtfarm_proto::{
+    Address, MESSAGE_BYTES, PROTOCOL, WireError, WorkerId,
+    wire::{self, farm_client::FarmClient, lease_response},
+};
+use tonic::{Code, Status, transport::Channel};
+
+use crate::{
+    call::{Answer, Call, CallError, CallErrorKind, Delivery, Next, Run},
+    config::Config,
+    job::{Job, JobError},
+};
+
+/// Reaches a coordinator.
+pub(crate) async fn connect(address: &Address) -> Result<FarmClient<Channel>, CallError> {
+    let channel = address.connect().await.map_err(|error| {
+        let mut reason: &dyn Error = &error;
+        while let Some(source) = reason.source() {
+            reason = source;
+        }
+        CallError { kind: CallErrorKind::NoAnswer, message: reason.to_string() }
+    })?;
+    Ok(FarmClient::new(channel)
+        .max_decoding_message_size(MESSAGE_BYTES)
+        .max_encoding_message_size(MESSAGE_BYTES))
+}
+
+/// What this process says of itself when it joins. `nonce` tells its repeated question from
+/// another process.
+pub(crate) fn introduction(config: &Config, nonce: u64) -> wire::JoinRequest {
+    wire::JoinRequest {
+        version: config.version.clone(),
+        protocol: PROTOCOL,
+        nonce,
+        threads: u32::try_from(config.threads).unwrap_or(u32::MAX),
+        isa: config.isa.to_string(),
+        host: rustix::system::uname().nodename().to_string_lossy().into_owned(),
+        process: std::process::id(),
+    }
+}
+
+/// Makes a call on a connection, once.
+pub(crate) async fn ask(
+    mut client: FarmClient<Channel>,
+    introduction: Arc<wire::JoinRequest>,
+    call: Call,
+) -> Result<Answer, CallError> {
+    match call {
+        Call::Connect => Ok(Answer::Connected),
+        Call::Join => {
+            let joined = client.join(wire::JoinRequest::clone(&introduction)).await?.into_inner();
+            let term = Duration::from_millis(joined.term_ms.into());
+            Ok(Answer::Joined { worker: WorkerId(joined.worker), term })
+        }
+        Call::Lease { worker, most_tiles, wait } => {
+            let request = wire::LeaseRequest {
+                worker: worker.0,
+                max_tiles: u32::try_from(most_tiles).unwrap_or(u32::MAX),
+                wait_ms: u32::try_from(wait.as_millis()).unwrap_or(u32::MAX),
+            };
+            Ok(Answer::Leased(read_next(client.lease(request).await?.into_inner())?))
+        }
+        Call::Renew { worker, leases } => {
+            let leases = leases.into_iter().map(Into::into).collect();
+            let renewed = client.renew(wire::RenewRequest { worker: worker.0, leases }).await?;
+            let lost = renewed.into_inner().lost.into_iter().map(Into::into).collect();
+            Ok(Answer::Renewed { lost })
+        }
+        Call::Deliver { worker, tile } => {
+            let number = tile.tile.number();
+            let delivered = client.deliver(write_delivery(worker, tile)).await?.into_inner();
+            tracing::debug!(tile = number, verdict = ?delivered.verdict(), "delivered");
+            Ok(Answer::Delivered)
+        }
+        Call::Leave { worker, reason } => {
+            client.leave(wire::LeaveRequest { worker: worker.0, reason }).await?;
+            Ok(Answer::Left)
+        }
+    }
+}
+
+fn write_delivery(worker: WorkerId, delivery: Delivery) -> wire::DeliverRequest {
+    wire::DeliverRequest {
+        worker: worker.0,
+        lease: Some(delivery.lease.into()),
+        tile: delivery.tile.number(),
+        pixels: delivery.pixels,
+        hash: delivery.hash.to_vec().into(),
+        seconds: delivery.seconds,
+        tally: Some(delivery.tally.into()),
+    }
+}
+
+fn read_next(answer: wire::LeaseResponse) -> Result<Next, JobError> {
+    match answer.next {
+        Some(lease_response::Next::Run(run)) => read_run(run).map(Next::Run),
+        Some(lease_response::Next::ShutDown(_)) => Ok(Next::ShutDown),
+        Some(lease_response::Next::Nothing(_)) | None => Ok(Next::Nothing),
+    }
+}
+
+fn read_run(run: wire::Run) -> Result<Run, JobError> {
+    let lease = run.lease.ok_or(WireError::Missing("lease"))?.into();
+    let job = Job::try_from(run.job.ok_or(WireError::Missing("job"))?)?;
+    let tile = |&number| job.grid.tile(number).ok_or(WireError::Missing("tile"));
+    let tiles = run.tiles.iter().map(tile).collect::<Result<_, _>>()?;
+    Ok(Run { lease, tiles, job: Arc::new(job) })
+}
+
+impl From<JobError> for CallError {
+    fn from(error: JobError) -> Self {
+        Self { kind: CallErrorKind::Nonsense, message: error.to_string() }
+    }
+}
+
+impl From<Status> for CallError {
+    fn from(status: Status) -> Self {
+        let kind = match status.code() {
+            Code::Unavailable
+            | Code::DeadlineExceeded
+            | Code::Unknown
+            | Code::Cancelled
+            | Code::DataLoss => CallErrorKind::NoAnswer,
+            Code::NotFound => CallErrorKind::NotMember,
+            Code::FailedPrecondition | Code::InvalidArgument => CallErrorKind::Refused,
+            _ => CallErrorKind::Other,
+        };
+        Self { kind, message: status.message().to_owned() }
+    }
+}

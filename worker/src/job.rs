@@ -1,0 +1,45 @@
+//! A job as a worker sees it.
+
+use std::{path::Path, sync::Arc};
+
+use rtfarm_core::{
+    prepared::SceneHash,
+    render::Settings,
+    tile::{TileGrid, TileSideError},
+};
+use rtfarm_proto::{WireError, scene_hash, wire};
+
+/// What a worker needs to know to render tiles of a job.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct Job {
+    pub(crate) scene: SceneHash,
+    pub(crate) scene_byte_count: u64,
+    /// Where the scene is on this machine; `None` when it has to be fetched.
+    pub(crate) scene_path: Option<Arc<Path>>,
+    pub(crate) settings: Settings,
+    pub(crate) grid: TileGrid,
+}
+
+/// Why a message describes no job.
+#[derive(Debug, thiserror::Error)]
+pub(crate) enum JobError {
+    #[error(transparent)]
+    Wire(#[from] WireError),
+    #[error(transparent)]
+    TileSide(#[from] TileSideError),
+}
+
+impl TryFrom<wire::Job> for Job {
+    type Error = JobError;
+
+    fn try_from(job: wire::Job) -> Result<Self, JobError> {
+        let settings: Settings = job.settings.ok_or(WireError::Missing("settings"))?.try_into()?;
+        Ok(Self {
+            scene: scene_hash(&job.scene_hash)?,
+            scene_byte_count: job.scene_bytes,
+            scene_path: (!job.scene_path.is_empty()).then(|| Path::new(&job.scene_path).into()),
+            settings,
+            grid: TileGrid::new(settings.size, job.tile_side.into())?,
+        })
+    }
+}

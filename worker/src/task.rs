@@ -1,0 +1,237 @@
+//! What a worker has begun and waits for: when each task is overdue, and when a call that failed
+//! is made again. Time is an argument.
+
+use std::{
+    collections::{BTreeMap, BTreeSet, VecDeque},
+    sync::Arc,
+    time::{Duration, Instant},
+};
+
+use backon::{BackoffBuilder, ExponentialBuilder};
+use rtfarm_core::{prepared::SceneHash, tile::TileId};
+use rtfarm_proto::LeaseName;
+
+use crate::{
+    call::{Call, CallError, CallErrorKind},
+    error::WorkerError,
+    job::Job,
+};
+
+/// Something that was begun and will report back once. Numbers are never given twice, so that a
+/// report that comes too late is known.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub(crate) struct TaskId(u64);
+
+/// What the shell is to do.
+#[derive(Debug)]
+pub(crate) enum Action {
+    /// Make a call.
+    Call(TaskId, Call),
+    /// Bring a job's scene into memory. No piece of it may take longer than `silence`.
+    Fetch { task: TaskId, job: Arc<Job>, silence: Duration },
+    /// Render a tile of a job whose scene is in memory; those that came earlier go first.
+    Render { task: TaskId, lease: LeaseName, tile: TileId, job: Arc<Job> },
+    /// Stop a task. A call or a fetch does not report any more; a rendering does so soon.
+    Stop(TaskId),
+    /// Forget a scene: no tile of it will be begun.
+    ForgetScene(SceneHash),
+    /// Listen for signs of progress from now on, no more than one a period.
+    HearBeats { period: Duration },
+    /// End; nothing comes after this.
+    Exit(Result<(), WorkerError>),
+}
+
+/// The delays between the attempts of one call.
+type Backoff = <ExponentialBuilder as BackoffBuilder>::Backoff;
+
+#[derive(Debug)]
+enum Task {
+    /// Waits for its answer until `deadline`.
+    Asked {
+        call: Call,
+        backoff: Backoff,
+        deadline: Instant,
+    },
+    /// Failed, and waits for its timer to be asked again.
+    Failed {
+        call: Call,
+        backoff: Backoff,
+    },
+    Fetch,
+    Render(LeaseName),
+}
+
+/// All that is under way, and what is still to be told to the shell.
+/// Invariant: each call has one timer, for its deadline or its next attempt; nothing else has.
+#[derive(Debug)]
+pub(crate) struct Tasks {
+    patience: Duration,
+    seed: u64,
+    begun: BTreeMap<TaskId, Task>,
+    begun_count: u64,
+    timers: BTreeSet<(Instant, TaskId)>,
+    actions: VecDeque<Action>,
+}
+
+/// A call that will not be repeated.
+#[derive(Debug)]
+pub(crate) struct GivenUp {
+    pub(crate) call: Call,
+    pub(crate) error: CallError,
+}
+
+impl Tasks {
+    /// Nothing is under way. Calls that fail for want of an answer are repeated with growing
+    /// delays, which `seed` shuffles, until these would add up to more than `patience`.
+    pub(crate) fn new(patience: Duration, seed: u64) -> Self {
+        Self {
+            patience,
+            seed,
+            begun: BTreeMap::new(),
+            begun_count: 0,
+            timers: BTreeSet::new(),
+            actions: VecDeque::new(),
+        }
+    }
+
+    pub(crate) fn next_action(&mut self) -> Option<Action> {
+        self.actions.pop_front()
+    }
+
+    pub(crate) fn push(&mut self, action: Action) {
+        self.actions.push_back(action);
+    }
+
+    /// When the first call is overdue or is to be repeated.
+    pub(crate) fn wake_at(&self) -> Option<Instant> {
+        self.timers.first().map(|&(at, _)| at)
+    }
+
+    /// Begins a call.
+    pub(crate) fn call(&mut self, call: Call, now: Instant) {
+        let backoff = ExponentialBuilder::new()
+            .with_jitter()
+            .with_jitter_seed(self.seed ^ self.begun_count)
+            .with_min_delay(Duration::from_millis(50))
+            .with_max_delay(Duration::from_secs(2))
+            .with_total_delay(Some(self.patience))
+            .without_max_times()
+            .build();
+        self.ask(call, backoff, now);
+    }
+
+    fn ask(&mut self, call: Call, backoff: Backoff, now: Instant) {
+        let deadline = now + call.deadline();
+        self.actions.push_back(Action::Call(TaskId(self.begun_count), call.clone()));
+        let task = self.begin(Task::Asked { call, backoff, deadline });
+        self.timers.insert((deadline, task));
+    }
+
+    /// Begins to bring a scene into memory.
+    pub(crate) fn fetch(&mut self, job: Arc<Job>, silence: Duration) {
+        let task = self.begin(Task::Fetch);
+        self.actions.push_back(Action::Fetch { task, job, silence });
+    }
+
+    /// Begins to render a tile.
+    pub(crate) fn render(&mut self, lease: LeaseName, tile: TileId, job: Arc<Job>) {
+        let task = self.begin(Task::Render(lease));
+        self.actions.push_back(Action::Render { task, lease, tile, job });
+    }
+
+    fn begin(&mut self, begun: Task) -> TaskId {
+        let task = TaskId(self.begun_count);
+        self.begun_count += 1;
+        self.begun.insert(task, begun);
+        task
+    }
+
+    /// Event: a call was answered. `None` when nobody waits for it.
+    pub(crate) fn on_answer(&mut self, task: TaskId) -> Option<Call> {
+        self.take_asked(task).map(|(call, _)| call)
+    }
+
+    fn take_asked(&mut self, task: TaskId) -> Option<(Call, Backoff)> {
+        match self.begun.remove(&task)? {
+            Task::Asked { call, backoff, deadline } => {
+                self.timers.remove(&(deadline, task));
+                Some((call, backoff))
+            }
+            other => {
+                self.begun.insert(task, other);
+                None
+            }
+        }
+    }
+
+    /// Event: a fetch or a rendering has ended. Whether anybody waits for it.
+    pub(crate) fn on_end(&mut self, task: TaskId) -> bool {
+        let is_awaited = matches!(self.begun.get(&task), Some(Task::Fetch | Task::Render(_)));
+        is_awaited && self.begun.remove(&task).is_some()
+    }
+
+    /// Event: a call has failed. Answers with it when it will not be repeated.
+    pub(crate) fn on_call_failed(
+        &mut self,
+        task: TaskId,
+        error: CallError,
+        now: Instant,
+    ) -> Option<GivenUp> {
+        let (call, mut backoff) = self.take_asked(task)?;
+        let may_repeat = match call {
+            // Whatever the reason is, a coordinator may be there a moment later.
+            Call::Connect => true,
+            Call::Leave { .. } => false,
+            _ => error.kind == CallErrorKind::NoAnswer,
+        };
+        match backoff.next().filter(|_| may_repeat) {
+            Some(delay) => {
+                tracing::debug!(reason = error.message, ?delay, "asking again");
+                let task = self.begin(Task::Failed { call, backoff });
+                self.timers.insert((now + delay, task));
+                None
+            }
+            None => Some(GivenUp { call, error }),
+        }
+    }
+
+    /// Event: time passes. Answers with a call that will not be repeated, if there is one; ask
+    /// until there is none.
+    pub(crate) fn on_tick(&mut self, now: Instant) -> Option<GivenUp> {
+        while let Some(&(at, task)) = self.timers.first()
+            && at <= now
+        {
+            if matches!(self.begun.get(&task), Some(Task::Asked { .. })) {
+                self.actions.push_back(Action::Stop(task));
+                let message = "it did not answer in time".to_owned();
+                let error = CallError { kind: CallErrorKind::NoAnswer, message };
+                if let Some(given_up) = self.on_call_failed(task, error, now) {
+                    return Some(given_up);
+                }
+            } else {
+                self.timers.remove(&(at, task));
+                if let Some(Task::Failed { call, backoff }) = self.begun.remove(&task) {
+                    self.ask(call, backoff, now);
+                }
+            }
+        }
+        None
+    }
+
+    /// Stops the renderings under a lease; they still report.
+    pub(crate) fn stop_renderings(&mut self, of: LeaseName) {
+        let is_of_lease = |task: &Task| matches!(task, Task::Render(lease) if *lease == of);
+        let stopped = self.begun.iter().filter(|(_, task)| is_of_lease(task));
+        self.actions.extend(stopped.map(|(&task, _)| Action::Stop(task)));
+    }
+
+    /// Stops everything; nobody waits for any report any more.
+    pub(crate) fn stop_all(&mut self) {
+        self.timers.clear();
+        for (task, stopped) in std::mem::take(&mut self.begun) {
+            if !matches!(stopped, Task::Failed { .. }) {
+                self.actions.push_back(Action::Stop(task));
+            }
+        }
+    }
+}

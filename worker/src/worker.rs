@@ -1,0 +1,395 @@
+//! A worker's life: it joins, asks for tiles, has them rendered, brings them, leaves. Decisions
+//! alone: what happens comes in as events with the time, what is to be done goes out as
+//! [`Action`]s, and nothing here waits.
+
+use std::{
+    collections::{BTreeMap, VecDeque},
+    mem,
+    sync::Arc,
+    time::{Duration, Instant},
+};
+
+use rtfarm_core::{prepared::SceneHash, tile::TileId};
+use rtfarm_proto::{Address, LONGEST_WAIT, LeaseName, WorkerId};
+
+use crate::{
+    call::{Answer, Call, CallError, CallErrorKind, Delivery, Next, Run},
+    config::Config,
+    error::WorkerError,
+    job::Job,
+    scene::SceneError,
+    task::{Action, GivenUp, TaskId, Tasks},
+};
+
+/// Tiles that a thread may have before it, so that it never waits for the network. As many may
+/// be on their way to the coordinator.
+const TILES_AHEAD: usize = 2;
+
+/// Tiles that are handed to the threads at once, for each of them: the one that it renders and
+/// those before it.
+const TILES_AT_HAND: usize = 1 + TILES_AHEAD;
+
+/// The most tiles whose pixels may be in memory or in the making, for each thread: a coordinator
+/// that takes pixels slowly stops the threads.
+const MOST_TILES_OF_PIXELS: usize = TILES_AT_HAND + TILES_AHEAD;
+
+/// The longest run that is asked for, in tiles a thread.
+const LONGEST_RUN_A_THREAD: usize = 32;
+
+/// Progress is told so many times before a lease would run out.
+const BEATS_A_TERM: u32 = 4;
+
+/// A piece of a scene must come within this time.
+const CHUNK_DEADLINE: Duration = Duration::from_secs(30);
+
+/// A worker.
+#[derive(Debug)]
+pub(crate) struct Worker {
+    coordinator: Address,
+    threads: usize,
+    tasks: Tasks,
+    stage: Stage,
+}
+
+#[derive(Debug)]
+enum Stage {
+    /// Connects, then joins.
+    Joining,
+    Working(Member),
+    /// Has given its leases back and waits to be heard; then it ends so.
+    Leaving(Result<(), WorkerError>),
+    Ended,
+}
+
+/// A worker that has joined.
+#[derive(Debug)]
+struct Member {
+    id: WorkerId,
+    threads: usize,
+    /// The leases that this worker knows to have, and the tiles of each that are not on their way
+    /// to the coordinator yet: at least one.
+    leases: BTreeMap<LeaseName, usize>,
+    /// A run whose scene is being brought into memory.
+    fetching: Option<Run>,
+    /// Scenes in memory, the latest last.
+    scenes: Vec<SceneHash>,
+    /// Tiles that wait for a thread, first come first served.
+    waiting: VecDeque<Waiting>,
+    /// Tiles in the hands of the threads.
+    rendering_count: usize,
+    /// Tiles that wait to be delivered.
+    rendered: VecDeque<Delivery>,
+    /// Tiles on their way to the coordinator, which has not acknowledged them yet.
+    delivering_count: usize,
+    is_leasing: bool,
+    is_renewing: bool,
+    /// Whether there was progress that the coordinator has not been told of.
+    has_beaten: bool,
+}
+
+#[derive(Debug)]
+struct Waiting {
+    lease: LeaseName,
+    tile: TileId,
+    job: Arc<Job>,
+}
+
+impl Worker {
+    /// A worker that begins to look for its coordinator. `seed` should differ between workers, so
+    /// that they do not all repeat their calls at the same moments.
+    pub(crate) fn new(config: &Config, seed: u64, now: Instant) -> Self {
+        let mut tasks = Tasks::new(config.patience, seed);
+        tasks.call(Call::Connect, now);
+        Self {
+            coordinator: config.coordinator.clone(),
+            threads: config.threads,
+            tasks,
+            stage: Stage::Joining,
+        }
+    }
+
+    /// What is to be done next, if there is anything. Ask after every event until there is not.
+    pub(crate) fn next_action(&mut self) -> Option<Action> {
+        self.tasks.next_action()
+    }
+
+    /// When to call [`Worker::on_tick`] if nothing happens before.
+    pub(crate) fn wake_at(&self) -> Option<Instant> {
+        self.tasks.wake_at()
+    }
+
+    /// Event: the coordinator has answered a call.
+    pub(crate) fn on_answer(&mut self, task: TaskId, answer: Answer, now: Instant) {
+        if self.tasks.on_answer(task).is_none() {
+            return;
+        }
+        match (&mut self.stage, answer) {
+            (Stage::Joining, Answer::Connected) => self.tasks.call(Call::Join, now),
+            (Stage::Joining, Answer::Joined { worker, term }) => {
+                tracing::info!(worker = worker.0, coordinator = %self.coordinator, "joined");
+                self.tasks.push(Action::HearBeats { period: term / BEATS_A_TERM });
+                self.stage = Stage::Working(Member::new(worker, self.threads));
+            }
+            (Stage::Working(member), Answer::Leased(next)) => {
+                member.is_leasing = false;
+                match next {
+                    Next::Run(run) => member.on_run(run, &mut self.tasks),
+                    Next::Nothing => {}
+                    Next::ShutDown => {
+                        tracing::info!(worker = member.id.0, "sent home");
+                        self.end(Ok(()));
+                    }
+                }
+            }
+            (Stage::Working(member), Answer::Renewed { lost }) => {
+                member.is_renewing = false;
+                member.on_leases_lost(&lost, &mut self.tasks);
+            }
+            (Stage::Working(member), Answer::Delivered) => member.delivering_count -= 1,
+            (Stage::Leaving(_), Answer::Left) => self.end_as_left(),
+            (stage, answer) => unreachable!("{answer:?} was not asked for while {stage:?}"),
+        }
+        self.proceed(now);
+    }
+
+    /// Event: a call has failed.
+    pub(crate) fn on_call_failed(&mut self, task: TaskId, error: CallError, now: Instant) {
+        if let Some(given_up) = self.tasks.on_call_failed(task, error, now) {
+            self.on_given_up(given_up, now);
+        }
+    }
+
+    /// Event: a scene is in memory.
+    pub(crate) fn on_fetched(&mut self, task: TaskId, now: Instant) {
+        if self.tasks.on_end(task)
+            && let Stage::Working(member) = &mut self.stage
+        {
+            member.on_fetched();
+            self.proceed(now);
+        }
+    }
+
+    /// Event: a scene cannot be brought into memory.
+    pub(crate) fn on_fetch_failed(&mut self, task: TaskId, error: SceneError, now: Instant) {
+        if self.tasks.on_end(task) {
+            self.leave(Err(error.into()), now);
+        }
+    }
+
+    /// Event: a thread is done with a tile; it has no pixels if it was stopped.
+    pub(crate) fn on_tile_rendered(&mut self, task: TaskId, tile: Option<Delivery>, now: Instant) {
+        if self.tasks.on_end(task)
+            && let Stage::Working(member) = &mut self.stage
+        {
+            member.rendering_count -= 1;
+            // The pixels are welcome even if the lease was lost meanwhile.
+            member.rendered.extend(tile);
+            self.proceed(now);
+        }
+    }
+
+    /// Event: a thread or a fetch has made progress.
+    pub(crate) fn on_beat(&mut self, now: Instant) {
+        if let Stage::Working(member) = &mut self.stage {
+            // Without a lease there is nothing that progress could prove.
+            member.has_beaten = !member.leases.is_empty();
+            self.proceed(now);
+        }
+    }
+
+    /// Event: time passes.
+    pub(crate) fn on_tick(&mut self, now: Instant) {
+        while let Some(given_up) = self.tasks.on_tick(now) {
+            self.on_given_up(given_up, now);
+        }
+    }
+
+    /// Event: somebody wants this worker to end.
+    pub(crate) fn on_stop(&mut self, now: Instant) {
+        match self.stage {
+            Stage::Joining => self.end(Ok(())),
+            Stage::Working(_) => self.leave(Ok(()), now),
+            Stage::Leaving(_) | Stage::Ended => {}
+        }
+    }
+
+    fn on_given_up(&mut self, GivenUp { call, error }: GivenUp, now: Instant) {
+        let CallError { kind, message } = error;
+        let error = match (&call, kind) {
+            (Call::Leave { .. }, _) => return self.end_as_left(),
+            (Call::Connect, _) => WorkerError::Connect(self.coordinator.clone(), message),
+            (Call::Join, CallErrorKind::Refused) => WorkerError::Refused(message),
+            (Call::Join, _) => WorkerError::Gone(message),
+            (_, CallErrorKind::NotMember) => return self.join_again(&message, now),
+            (_, CallErrorKind::Nonsense) => WorkerError::Nonsense(message),
+            _ => WorkerError::Gone(message),
+        };
+        match self.stage {
+            Stage::Working(_) => self.leave(Err(error), now),
+            _ => self.end(Err(error)),
+        }
+    }
+
+    /// The coordinator does not know this worker any more, nor its leases.
+    fn join_again(&mut self, reason: &str, now: Instant) {
+        tracing::warn!(reason, "joining again");
+        self.tasks.stop_all();
+        if let Stage::Working(member) = mem::replace(&mut self.stage, Stage::Joining) {
+            for scene in member.scenes {
+                self.tasks.push(Action::ForgetScene(scene));
+            }
+        }
+        self.tasks.call(Call::Join, now);
+    }
+
+    /// Stops all work, and gives every lease back if the coordinator can still be told.
+    fn leave(&mut self, exit: Result<(), WorkerError>, now: Instant) {
+        let Stage::Working(member) = &self.stage else { return };
+        let reason = match &exit {
+            Ok(()) => "the worker was stopped".to_owned(),
+            Err(error) => error.to_string(),
+        };
+        let leave = Call::Leave { worker: member.id, reason };
+        self.tasks.stop_all();
+        self.tasks.call(leave, now);
+        self.stage = Stage::Leaving(exit);
+    }
+
+    fn end_as_left(&mut self) {
+        if let Stage::Leaving(exit) = mem::replace(&mut self.stage, Stage::Ended) {
+            self.end(exit);
+        }
+    }
+
+    fn end(&mut self, exit: Result<(), WorkerError>) {
+        self.tasks.stop_all();
+        self.tasks.push(Action::Exit(exit));
+        self.stage = Stage::Ended;
+    }
+
+    fn proceed(&mut self, now: Instant) {
+        if let Stage::Working(member) = &mut self.stage {
+            member.proceed(&mut self.tasks, now);
+        }
+    }
+}
+
+impl Member {
+    fn new(id: WorkerId, threads: usize) -> Self {
+        Self {
+            id,
+            threads,
+            leases: BTreeMap::new(),
+            fetching: None,
+            scenes: Vec::new(),
+            waiting: VecDeque::new(),
+            rendering_count: 0,
+            rendered: VecDeque::new(),
+            delivering_count: 0,
+            is_leasing: false,
+            is_renewing: false,
+            has_beaten: false,
+        }
+    }
+
+    fn on_run(&mut self, run: Run, tasks: &mut Tasks) {
+        if run.tiles.is_empty() {
+            return;
+        }
+        self.leases.insert(run.lease, run.tiles.len());
+        if self.scenes.contains(&run.job.scene) {
+            self.queue(run);
+        } else {
+            tasks.fetch(Arc::clone(&run.job), CHUNK_DEADLINE);
+            self.fetching = Some(run);
+        }
+    }
+
+    fn on_fetched(&mut self) {
+        if let Some(run) = self.fetching.take() {
+            self.scenes.push(run.job.scene);
+            // The lease may have been lost meanwhile.
+            if self.leases.contains_key(&run.lease) {
+                self.queue(run);
+            }
+        }
+    }
+
+    fn queue(&mut self, run: Run) {
+        let Run { lease, tiles, job } = run;
+        let waiting = |tile| Waiting { lease, tile, job: Arc::clone(&job) };
+        self.waiting.extend(tiles.into_iter().map(waiting));
+    }
+
+    fn on_leases_lost(&mut self, lost: &[LeaseName], tasks: &mut Tasks) {
+        for &name in lost {
+            if self.leases.remove(&name).is_some() {
+                tracing::info!(worker = self.id.0, ?name, "lost a lease");
+                self.waiting.retain(|waiting| waiting.lease != name);
+                tasks.stop_renderings(name);
+            }
+        }
+    }
+
+    /// Begins whatever can be begun now.
+    fn proceed(&mut self, tasks: &mut Tasks, now: Instant) {
+        while self.delivering_count < TILES_AHEAD * self.threads
+            && let Some(tile) = self.rendered.pop_front()
+        {
+            self.on_tile_sent(tile.lease);
+            self.delivering_count += 1;
+            tasks.call(Call::Deliver { worker: self.id, tile }, now);
+        }
+        while self.has_room_for_pixels()
+            && let Some(Waiting { lease, tile, job }) = self.waiting.pop_front()
+        {
+            self.rendering_count += 1;
+            tasks.render(lease, tile, job);
+        }
+        self.forget_scenes(tasks);
+
+        let tiles_left: usize = self.leases.values().sum();
+        let is_short = tiles_left < TILES_AHEAD * self.threads;
+        if is_short && !self.is_leasing && self.fetching.is_none() {
+            self.is_leasing = true;
+            let most_tiles = LONGEST_RUN_A_THREAD * self.threads;
+            tasks.call(Call::Lease { worker: self.id, most_tiles, wait: LONGEST_WAIT }, now);
+        }
+        if self.has_beaten && !self.is_renewing && !self.leases.is_empty() {
+            self.has_beaten = false;
+            self.is_renewing = true;
+            let leases = self.leases.keys().copied().collect();
+            tasks.call(Call::Renew { worker: self.id, leases }, now);
+        }
+    }
+
+    fn has_room_for_pixels(&self) -> bool {
+        let pixels = self.rendering_count + self.rendered.len() + self.delivering_count;
+        self.rendering_count < TILES_AT_HAND * self.threads
+            && pixels < MOST_TILES_OF_PIXELS * self.threads
+    }
+
+    fn on_tile_sent(&mut self, name: LeaseName) {
+        if let Some(tiles_left) = self.leases.get_mut(&name) {
+            *tiles_left -= 1;
+            if *tiles_left == 0 {
+                self.leases.remove(&name);
+            }
+        }
+    }
+
+    /// Keeps the latest scene and those that waiting tiles need.
+    fn forget_scenes(&mut self, tasks: &mut Tasks) {
+        let Some((&latest, [_, ..])) = self.scenes.split_last() else { return };
+        let waiting = &self.waiting;
+        let is_needed = |scene: &SceneHash| {
+            *scene == latest || waiting.iter().any(|waiting| waiting.job.scene == *scene)
+        };
+        for forgotten in self.scenes.extract_if(.., |scene| !is_needed(scene)) {
+            tasks.push(Action::ForgetScene(forgotten));
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests;

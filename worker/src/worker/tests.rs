@@ -1,0 +1,770 @@
+//! A worker's life under a simulated clock, with a coordinator played by hand or by chance.
+
+use std::collections::BTreeSet;
+
+use rtfarm_core::{
+    render::{Quality, Settings, Tally},
+    tile::{Size, TileGrid},
+};
+use rtfarm_proto::wire;
+
+use super::*;
+
+const TERM: Duration = Duration::from_secs(4);
+const PATIENCE: Duration = Duration::from_secs(30);
+
+#[expect(clippy::disallowed_methods, reason = "any instant will do")]
+fn start() -> Instant {
+    Instant::now()
+}
+
+fn lease(number: u64) -> LeaseName {
+    wire::LeaseName { job: 1, id: number }.into()
+}
+
+fn grid() -> TileGrid {
+    TileGrid::new(Size::new(160, 160).unwrap(), 16).unwrap()
+}
+
+fn job(scene: u8) -> Arc<Job> {
+    Arc::new(Job {
+        scene: SceneHash([scene; 32]),
+        scene_byte_count: 1,
+        scene_path: None,
+        settings: Settings { size: Size::new(160, 160).unwrap(), quality: Quality::default() },
+        grid: grid(),
+    })
+}
+
+/// `count` tiles of a job with the scene `scene`.
+fn run(number: u64, count: u32, scene: u8) -> Answer {
+    let tiles = (0..count).map(|tile| grid().tile(tile).unwrap()).collect();
+    Answer::Leased(Next::Run(Run { lease: lease(number), tiles, job: job(scene) }))
+}
+
+fn delivery(lease: LeaseName, tile: TileId) -> Delivery {
+    let pixels = tile.number().to_le_bytes().to_vec().into();
+    Delivery { lease, tile, pixels, hash: [0; 32], tally: Tally::default(), seconds: 0.0 }
+}
+
+fn no_answer() -> CallError {
+    CallError { kind: CallErrorKind::NoAnswer, message: "no way".to_owned() }
+}
+
+fn failure(kind: CallErrorKind) -> CallError {
+    CallError { kind, message: "for a reason".to_owned() }
+}
+
+fn is_lease(call: &Call) -> bool {
+    matches!(call, Call::Lease { .. })
+}
+
+fn is_renew(call: &Call) -> bool {
+    matches!(call, Call::Renew { .. })
+}
+
+fn is_deliver(call: &Call) -> bool {
+    matches!(call, Call::Deliver { .. })
+}
+
+/// A worker, and what it wants done.
+struct Bench {
+    worker: Worker,
+    threads: usize,
+    now: Instant,
+    calls: BTreeMap<TaskId, Call>,
+    fetches: BTreeMap<TaskId, SceneHash>,
+    renderings: BTreeMap<TaskId, (LeaseName, TileId)>,
+    /// Renderings that were stopped and have not reported yet.
+    stopped: BTreeSet<TaskId>,
+    scenes: Vec<SceneHash>,
+    beat_period: Option<Duration>,
+    exit: Option<Result<(), String>>,
+}
+
+impl Bench {
+    /// A worker that connects.
+    fn new(threads: usize) -> Self {
+        let config = Config {
+            coordinator: Address::Tcp("host:1".to_owned()),
+            threads,
+            isa: rtfarm_core::isa::Isa::fastest(),
+            version: "1".to_owned(),
+            patience: PATIENCE,
+        };
+        let now = start();
+        let mut bench = Self {
+            worker: Worker::new(&config, 7, now),
+            threads,
+            now,
+            calls: BTreeMap::new(),
+            fetches: BTreeMap::new(),
+            renderings: BTreeMap::new(),
+            stopped: BTreeSet::new(),
+            scenes: Vec::new(),
+            beat_period: None,
+            exit: None,
+        };
+        bench.absorb();
+        bench
+    }
+
+    /// A worker that has joined and asks for tiles.
+    fn joined(threads: usize) -> Self {
+        let mut bench = Self::new(threads);
+        bench.answer(|call| matches!(call, Call::Connect), Answer::Connected);
+        bench.join(1);
+        bench
+    }
+
+    /// A worker that renders a run of so many tiles.
+    fn rendering(threads: usize, tile_count: u32) -> Self {
+        let mut bench = Self::joined(threads);
+        bench.answer(is_lease, run(1, tile_count, 0));
+        bench.fetch();
+        bench
+    }
+
+    fn join(&mut self, worker: u32) {
+        let joined = Answer::Joined { worker: WorkerId(worker), term: TERM };
+        self.answer(|call| matches!(call, Call::Join), joined);
+    }
+
+    /// Takes the worker's actions, and checks what always holds.
+    fn absorb(&mut self) {
+        while let Some(action) = self.worker.next_action() {
+            assert_eq!(self.exit, None, "nothing comes after the end, but {action:?}");
+            match action {
+                Action::Call(task, call) => drop(self.calls.insert(task, call)),
+                Action::Fetch { task, job, .. } => drop(self.fetches.insert(task, job.scene)),
+                Action::Render { task, lease, tile, job } => {
+                    assert!(self.scenes.contains(&job.scene), "{tile:?} needs its scene");
+                    self.renderings.insert(task, (lease, tile));
+                }
+                Action::Stop(task) => {
+                    let is_call = self.calls.remove(&task).is_some();
+                    if !is_call && self.fetches.remove(&task).is_none() {
+                        assert!(self.renderings.contains_key(&task), "{task:?} is under way");
+                        self.stopped.insert(task);
+                    }
+                }
+                Action::ForgetScene(scene) => {
+                    let known = self.scenes.iter().position(|&known| known == scene);
+                    self.scenes.remove(known.expect("only what is known is forgotten"));
+                }
+                Action::HearBeats { period } => self.beat_period = Some(period),
+                Action::Exit(exit) => self.exit = Some(exit.map_err(|error| error.to_string())),
+            }
+        }
+        let at_hand = self.renderings.len() - self.stopped.len();
+        assert!(at_hand <= TILES_AT_HAND * self.threads, "{at_hand} tiles at hand");
+        let delivering = self.calls.values().filter(|call| is_deliver(call)).count();
+        assert!(delivering <= TILES_AHEAD * self.threads, "{delivering} tiles on their way");
+        let deadline = self.worker.wake_at();
+        assert!(self.calls.is_empty() || deadline.is_some(), "no call waits for ever");
+        if self.exit.is_some() {
+            assert!(self.calls.is_empty() && self.fetches.is_empty(), "nothing goes on");
+            assert_eq!(self.renderings.len(), self.stopped.len(), "nothing goes on");
+        }
+    }
+
+    fn find(&self, is_it: impl Fn(&Call) -> bool) -> TaskId {
+        let found = self.calls.iter().find(|(_, call)| is_it(call)).map(|(&task, _)| task);
+        found.unwrap_or_else(|| panic!("not among {:?}", self.calls))
+    }
+
+    fn take(&mut self, is_it: impl Fn(&Call) -> bool) -> (TaskId, Call) {
+        let task = self.find(is_it);
+        (task, self.calls.remove(&task).unwrap())
+    }
+
+    fn has(&self, is_it: impl Fn(&Call) -> bool) -> bool {
+        self.calls.values().any(is_it)
+    }
+
+    /// Answers the first such call.
+    fn answer(&mut self, is_it: impl Fn(&Call) -> bool, answer: Answer) -> Call {
+        let (task, call) = self.take(is_it);
+        self.worker.on_answer(task, answer, self.now);
+        self.absorb();
+        call
+    }
+
+    /// Has the first such call fail.
+    fn fail(&mut self, is_it: impl Fn(&Call) -> bool, error: CallError) -> Call {
+        let (task, call) = self.take(is_it);
+        self.worker.on_call_failed(task, error, self.now);
+        self.absorb();
+        call
+    }
+
+    /// Finishes the first fetch.
+    fn fetch(&mut self) {
+        let (task, scene) = self.fetches.pop_first().expect("a fetch");
+        self.scenes.push(scene);
+        self.worker.on_fetched(task, self.now);
+        self.absorb();
+    }
+
+    /// Finishes the first rendering, or notices that it was stopped.
+    fn render(&mut self) -> (LeaseName, TileId) {
+        let (&task, &(lease, tile)) = self.renderings.first_key_value().expect("a rendering");
+        self.renderings.remove(&task);
+        let pixels = (!self.stopped.remove(&task)).then(|| delivery(lease, tile));
+        self.worker.on_tile_rendered(task, pixels, self.now);
+        self.absorb();
+        (lease, tile)
+    }
+
+    fn beat(&mut self) {
+        self.worker.on_beat(self.now);
+        self.absorb();
+    }
+
+    fn stop(&mut self) {
+        self.worker.on_stop(self.now);
+        self.absorb();
+    }
+
+    /// Lets time pass until the worker wants to be woken.
+    fn sleep(&mut self) {
+        self.now = self.worker.wake_at().expect("something to wait for");
+        self.worker.on_tick(self.now);
+        self.absorb();
+    }
+}
+
+#[test]
+fn a_tile_goes_from_its_lease_to_its_delivery() {
+    let mut bench = Bench::joined(1);
+    assert_eq!(bench.beat_period, Some(TERM / 4));
+    let asked = bench.answer(is_lease, run(1, 1, 0));
+    let (worker, wait) = (WorkerId(1), LONGEST_WAIT);
+    assert_eq!(asked, Call::Lease { worker, most_tiles: LONGEST_RUN_A_THREAD, wait });
+    assert!(bench.calls.is_empty(), "nothing is asked for while a scene is fetched");
+    bench.fetch();
+    assert!(bench.has(is_lease), "one tile is too few to go on with");
+    let (name, tile) = bench.render();
+    let delivered = bench.answer(is_deliver, Answer::Delivered);
+    assert_eq!(delivered, Call::Deliver { worker, tile: delivery(name, tile) });
+    assert!(!bench.has(is_deliver));
+}
+
+#[test]
+fn tiles_are_asked_for_before_the_threads_run_dry() {
+    let mut bench = Bench::rendering(2, 9);
+    for left in (0..9).rev() {
+        bench.render();
+        bench.answer(is_deliver, Answer::Delivered);
+        assert_eq!(bench.has(is_lease), left < TILES_AHEAD * 2, "{left} tiles left");
+    }
+}
+
+#[test]
+fn tiles_are_rendered_in_the_order_in_which_they_came() {
+    let mut bench = Bench::rendering(1, 1);
+    bench.answer(is_lease, run(2, 5, 0));
+    let mut rendered = vec![bench.render()];
+    while bench.renderings.values().next().is_some() {
+        bench.answer(is_deliver, Answer::Delivered);
+        rendered.push(bench.render());
+    }
+    let tile = |number, tile| (lease(number), grid().tile(tile).unwrap());
+    assert_eq!(rendered, [tile(1, 0), tile(2, 0), tile(2, 1), tile(2, 2), tile(2, 3), tile(2, 4)]);
+}
+
+#[test]
+fn slow_deliveries_stop_the_threads_and_the_asking() {
+    let mut bench = Bench::rendering(1, 32);
+    let mut rendered = 0;
+    while !bench.renderings.is_empty() {
+        bench.render();
+        rendered += 1;
+    }
+    assert_eq!(rendered, MOST_TILES_OF_PIXELS);
+    assert!(!bench.has(is_lease));
+    bench.answer(is_deliver, Answer::Delivered);
+    assert_eq!(bench.renderings.len(), 1, "one out, one in");
+}
+
+#[test]
+fn pixels_are_kept_until_they_are_acknowledged() {
+    let mut bench = Bench::rendering(1, 1);
+    let (name, tile) = bench.render();
+    let expected = Call::Deliver { worker: WorkerId(1), tile: delivery(name, tile) };
+    for _ in 0..5 {
+        assert_eq!(bench.fail(is_deliver, no_answer()), expected);
+        assert!(!bench.has(is_deliver), "not at once");
+        while !bench.has(is_deliver) {
+            bench.sleep();
+        }
+    }
+    bench.answer(is_deliver, Answer::Delivered);
+    assert_eq!(bench.exit, None);
+}
+
+#[test]
+fn progress_renews_every_lease_one_renewal_at_a_time() {
+    let mut bench = Bench::rendering(1, 1);
+    bench.answer(is_lease, run(2, 9, 0));
+    assert!(!bench.has(is_renew), "time alone renews nothing");
+    bench.beat();
+    bench.beat();
+    let first = bench.answer(is_renew, Answer::Renewed { lost: vec![] });
+    let leases = vec![lease(1), lease(2)];
+    assert_eq!(first, Call::Renew { worker: WorkerId(1), leases });
+    bench.answer(is_renew, Answer::Renewed { lost: vec![] });
+    assert!(!bench.has(is_renew), "nothing new to tell");
+}
+
+#[test]
+fn nothing_is_renewed_without_a_lease() {
+    let mut bench = Bench::joined(1);
+    bench.beat();
+    bench.answer(is_lease, run(1, 1, 0));
+    assert!(!bench.has(is_renew));
+    bench.beat();
+    assert!(bench.has(is_renew), "a fetch makes progress too");
+}
+
+#[test]
+fn a_lost_lease_is_rendered_no_further_but_its_pixels_are_delivered() {
+    let mut bench = Bench::rendering(1, 9);
+    let (name, tile) = bench.render();
+    bench.beat();
+    bench.answer(is_renew, Answer::Renewed { lost: vec![lease(1)] });
+    assert_eq!(bench.stopped.len(), TILES_AT_HAND);
+    while !bench.renderings.is_empty() {
+        bench.render();
+    }
+    let delivered = bench.answer(is_deliver, Answer::Delivered);
+    assert_eq!(delivered, Call::Deliver { worker: WorkerId(1), tile: delivery(name, tile) });
+    assert!(!bench.has(is_deliver) && bench.has(is_lease));
+}
+
+#[test]
+fn a_lease_lost_while_its_scene_is_fetched_is_not_rendered() {
+    let mut bench = Bench::joined(1);
+    bench.answer(is_lease, run(1, 9, 0));
+    bench.beat();
+    bench.answer(is_renew, Answer::Renewed { lost: vec![lease(1)] });
+    bench.fetch();
+    assert!(bench.renderings.is_empty() && bench.has(is_lease));
+    bench.answer(is_lease, run(2, 1, 0));
+    assert!(bench.fetches.is_empty(), "the scene is there");
+    assert_eq!(bench.renderings.len(), 1);
+}
+
+#[test]
+fn a_scene_is_forgotten_when_another_came_and_no_tile_waits_for_it() {
+    let mut bench = Bench::rendering(1, 1);
+    bench.answer(is_lease, run(2, 4, 0));
+    while bench.renderings.len() > 1 {
+        bench.render();
+        bench.answer(is_deliver, Answer::Delivered);
+    }
+    bench.answer(is_lease, run(3, 7, 1));
+    assert_eq!(bench.scenes, [SceneHash([0; 32])]);
+    bench.fetch();
+    assert_eq!(bench.scenes, [SceneHash([1; 32])], "the last tile of the first was begun");
+}
+
+#[test]
+fn a_scene_that_waiting_tiles_need_is_kept() {
+    let mut bench = Bench::rendering(2, 3);
+    bench.answer(is_lease, run(2, 7, 0));
+    for _ in 0..7 {
+        bench.render();
+        bench.answer(is_deliver, Answer::Delivered);
+    }
+    bench.answer(is_lease, run(3, 9, 1));
+    bench.fetch();
+    bench.render();
+    while !bench.renderings.is_empty() {
+        if bench.has(is_deliver) {
+            bench.answer(is_deliver, Answer::Delivered);
+        }
+        bench.render();
+    }
+    assert_eq!(bench.scenes, [SceneHash([1; 32])]);
+}
+
+#[test]
+fn an_unusable_scene_ends_the_worker() {
+    let mut bench = Bench::joined(1);
+    bench.answer(is_lease, run(1, 9, 0));
+    let (task, _) = bench.fetches.pop_first().unwrap();
+    bench.worker.on_fetch_failed(task, SceneError::Hash, bench.now);
+    bench.absorb();
+    let reason = "the prepared scene does not have the hash that the job names".to_owned();
+    let left = bench.answer(|call| matches!(call, Call::Leave { .. }), Answer::Left);
+    assert_eq!(left, Call::Leave { worker: WorkerId(1), reason: reason.clone() });
+    assert_eq!(bench.exit, Some(Err(reason)));
+}
+
+#[test]
+fn a_forgotten_worker_stops_everything_and_joins_again() {
+    let mut bench = Bench::rendering(1, 9);
+    bench.render();
+    let late = bench.find(is_deliver);
+    bench.beat();
+    bench.fail(is_renew, failure(CallErrorKind::NotMember));
+    assert_eq!(bench.stopped.len(), bench.renderings.len());
+    assert!(bench.scenes.is_empty());
+    assert_eq!(bench.calls.values().collect::<Vec<_>>(), [&Call::Join]);
+    bench.join(2);
+    bench.worker.on_answer(late, Answer::Delivered, bench.now);
+    while !bench.renderings.is_empty() {
+        bench.render();
+    }
+    assert!(!bench.has(is_deliver), "nobody waits for what was stopped");
+    let asked = bench.answer(is_lease, run(1, 1, 0));
+    assert!(matches!(asked, Call::Lease { worker: WorkerId(2), .. }));
+    bench.fetch();
+    bench.render();
+    assert!(bench.has(is_deliver));
+}
+
+#[test]
+fn a_coordinator_that_is_not_there_is_sought_as_long_as_patience_lasts() {
+    let mut bench = Bench::new(1);
+    let begun = bench.now;
+    let mut attempts = 0;
+    while bench.exit.is_none() {
+        if bench.calls.is_empty() {
+            bench.sleep();
+        } else {
+            attempts += 1;
+            bench.fail(|_| true, no_answer());
+        }
+    }
+    let waited = bench.now - begun;
+    assert!(waited <= PATIENCE && waited + Duration::from_secs(4) > PATIENCE, "{waited:?}");
+    assert!((12..=25).contains(&attempts), "{attempts} attempts");
+    let reason = "no coordinator answers at http://host:1: no way".to_owned();
+    assert_eq!(bench.exit, Some(Err(reason)));
+}
+
+#[test]
+fn a_silent_coordinator_is_asked_again_and_in_the_end_given_up() {
+    let mut bench = Bench::joined(1);
+    let mut waited = Duration::ZERO;
+    while bench.has(is_lease) || !bench.has(|_| true) {
+        let (asked, before) = (bench.has(is_lease), bench.now);
+        bench.sleep();
+        if asked {
+            assert_eq!(bench.now - before, LONGEST_WAIT + Duration::from_secs(15));
+        } else {
+            waited += bench.now - before;
+        }
+    }
+    assert!(waited <= PATIENCE && waited + Duration::from_secs(4) > PATIENCE, "{waited:?}");
+    let before = bench.now;
+    bench.sleep();
+    assert_eq!(bench.now - before, Duration::from_secs(1), "nobody hears that it leaves");
+    let reason = "the coordinator is gone: it did not answer in time".to_owned();
+    assert_eq!(bench.exit, Some(Err(reason)));
+}
+
+#[test]
+fn workers_do_not_all_ask_again_at_once() {
+    let config = Config {
+        coordinator: Address::Tcp("host:1".to_owned()),
+        threads: 1,
+        isa: rtfarm_core::isa::Isa::fastest(),
+        version: "1".to_owned(),
+        patience: PATIENCE,
+    };
+    let now = start();
+    let pauses: BTreeSet<Duration> = (0..100)
+        .map(|seed| {
+            let mut worker = Worker::new(&config, seed, now);
+            let Some(Action::Call(task, Call::Connect)) = worker.next_action() else {
+                panic!("a worker connects first")
+            };
+            worker.on_call_failed(task, no_answer(), now);
+            worker.wake_at().unwrap() - now
+        })
+        .collect();
+    assert!(pauses.len() > 90, "{pauses:?}");
+    let bounds = Duration::from_millis(50)..=Duration::from_millis(100);
+    assert!(pauses.iter().all(|pause| bounds.contains(pause)), "{pauses:?}");
+}
+
+#[test]
+fn a_refused_worker_ends_at_once() {
+    for (kind, reason) in [
+        (CallErrorKind::Refused, "the coordinator refuses this worker: for a reason"),
+        (CallErrorKind::Other, "the coordinator is gone: for a reason"),
+        (CallErrorKind::NotMember, "the coordinator is gone: for a reason"),
+    ] {
+        let mut bench = Bench::new(1);
+        bench.answer(|call| matches!(call, Call::Connect), Answer::Connected);
+        bench.fail(|call| matches!(call, Call::Join), failure(kind));
+        assert_eq!(bench.exit, Some(Err(reason.to_owned())));
+    }
+}
+
+#[test]
+fn an_answer_without_sense_ends_the_worker() {
+    let mut bench = Bench::joined(1);
+    bench.fail(is_lease, failure(CallErrorKind::Nonsense));
+    bench.fail(|call| matches!(call, Call::Leave { .. }), failure(CallErrorKind::Other));
+    let reason = "the coordinator's answer makes no sense: for a reason".to_owned();
+    assert_eq!(bench.exit, Some(Err(reason)));
+}
+
+#[test]
+fn a_worker_sent_home_ends_well() {
+    let mut bench = Bench::rendering(1, 1);
+    bench.answer(is_lease, Answer::Leased(Next::ShutDown));
+    assert_eq!(bench.exit, Some(Ok(())));
+}
+
+#[test]
+fn a_worker_without_work_asks_again() {
+    let mut bench = Bench::joined(1);
+    for _ in 0..3 {
+        bench.answer(is_lease, Answer::Leased(Next::Nothing));
+    }
+    assert!(bench.has(is_lease));
+}
+
+#[test]
+fn a_run_without_tiles_is_nothing() {
+    let mut bench = Bench::joined(1);
+    bench.answer(is_lease, run(1, 0, 0));
+    assert!(bench.fetches.is_empty() && bench.has(is_lease));
+    bench.beat();
+    assert!(!bench.has(is_renew));
+}
+
+#[test]
+fn a_worker_that_has_not_joined_stops_at_once() {
+    let mut bench = Bench::new(1);
+    bench.stop();
+    assert_eq!(bench.exit, Some(Ok(())));
+    let mut bench = Bench::new(1);
+    bench.fail(|_| true, no_answer());
+    bench.stop();
+    assert_eq!(bench.exit, Some(Ok(())));
+    let mut bench = Bench::new(1);
+    bench.answer(|call| matches!(call, Call::Connect), Answer::Connected);
+    bench.stop();
+    assert_eq!(bench.exit, Some(Ok(())));
+}
+
+#[test]
+fn a_member_that_is_stopped_gives_its_leases_back() {
+    let mut bench = Bench::rendering(2, 9);
+    bench.stop();
+    assert_eq!(bench.stopped.len(), bench.renderings.len());
+    bench.stop();
+    let left = bench.answer(|_| true, Answer::Left);
+    let reason = "the worker was stopped".to_owned();
+    assert_eq!(left, Call::Leave { worker: WorkerId(1), reason });
+    assert_eq!(bench.exit, Some(Ok(())));
+}
+
+/// Steele, Lea & Flood, "Fast Splittable Pseudorandom Number Generators" (2014).
+struct SplitMix64(u64);
+
+impl SplitMix64 {
+    fn below(&mut self, end: u64) -> u64 {
+        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
+        let mut z = self.0;
+        z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+        z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
+        (z ^ (z >> 31)) % end
+    }
+
+    fn is_one_in(&mut self, n: u64) -> bool {
+        self.below(n) == 0
+    }
+}
+
+/// Something under way.
+enum Letter {
+    /// A call reaches the coordinator.
+    Question(TaskId, Call),
+    /// What it says reaches the worker.
+    Answer(TaskId, Result<Answer, CallError>),
+    /// The next scene is in memory.
+    Fetched(TaskId, SceneHash),
+    /// A thread is done.
+    Rendered(TaskId),
+    Beat,
+}
+
+/// A coordinator that forgets, and a network that delays and loses.
+struct Chance {
+    random: SplitMix64,
+    post: Vec<(Instant, Letter)>,
+    /// The worker's number now.
+    member: Option<WorkerId>,
+    member_count: u32,
+    /// Tiles of two jobs that are not leased.
+    free: Vec<(u8, TileId)>,
+    leases: BTreeMap<LeaseName, (u8, BTreeSet<TileId>)>,
+    lease_count: u64,
+    delivered: BTreeSet<(u8, TileId)>,
+}
+
+impl Chance {
+    fn post(&mut self, now: Instant, letter: Letter) {
+        let delay = if self.random.is_one_in(50) { 40_000 } else { self.random.below(300) };
+        self.post.push((now + Duration::from_millis(delay), letter));
+    }
+
+    fn on_question(&mut self, call: Call) -> Result<Answer, CallError> {
+        if self.random.is_one_in(200) {
+            self.member = None;
+            self.take_back(|_| true);
+        }
+        let is_member = |chance: &Self, worker| {
+            let is_known = chance.member == Some(worker);
+            if is_known { Ok(()) } else { Err(failure(CallErrorKind::NotMember)) }
+        };
+        match call {
+            Call::Connect => Ok(Answer::Connected),
+            Call::Join => {
+                if self.member.is_none() {
+                    self.member_count += 1;
+                    self.member = Some(WorkerId(self.member_count));
+                }
+                Ok(Answer::Joined { worker: self.member.unwrap(), term: TERM })
+            }
+            Call::Lease { worker, most_tiles, .. } => {
+                is_member(self, worker)?;
+                Ok(Answer::Leased(self.lease(most_tiles)))
+            }
+            Call::Renew { worker, leases } => {
+                is_member(self, worker)?;
+                let gone = self.random.below(20);
+                self.take_back(|name| leases.contains(name) && name.id.0 % 20 == gone);
+                let known = &self.leases;
+                let lost = leases.into_iter().filter(|name| !known.contains_key(name)).collect();
+                Ok(Answer::Renewed { lost })
+            }
+            Call::Deliver { tile, .. } => {
+                if let Some((scene, tiles)) = self.leases.get_mut(&tile.lease) {
+                    tiles.remove(&tile.tile);
+                    self.delivered.insert((*scene, tile.tile));
+                }
+                Ok(Answer::Delivered)
+            }
+            Call::Leave { .. } => Ok(Answer::Left),
+        }
+    }
+
+    fn lease(&mut self, most_tiles: usize) -> Next {
+        if self.delivered.len() == 2 * grid().count() as usize {
+            return Next::ShutDown;
+        }
+        // A lease whose answer was lost runs out.
+        if self.free.is_empty() {
+            self.take_back(|_| true);
+        }
+        self.free.sort_unstable();
+        let Some(&(scene, _)) = self.free.first() else { return Next::Nothing };
+        let most = 1 + self.random.below(most_tiles as u64) as usize;
+        let count = self.free.iter().take_while(|tile| tile.0 == scene).take(most).count();
+        let tiles: Vec<TileId> = self.free.drain(..count).map(|(_, tile)| tile).collect();
+        self.lease_count += 1;
+        let name = lease(self.lease_count);
+        self.leases.insert(name, (scene, tiles.iter().copied().collect()));
+        Next::Run(Run { lease: name, tiles, job: job(scene) })
+    }
+
+    fn take_back(&mut self, is_lost: impl Fn(&LeaseName) -> bool) {
+        for (_, (scene, tiles)) in self.leases.extract_if(.., |name, _| is_lost(name)) {
+            self.free.extend(tiles.into_iter().map(|tile| (scene, tile)));
+        }
+    }
+}
+
+/// Plays a worker's life to its end.
+fn simulate(seed: u64) {
+    let mut bench = Bench::new(1 + (seed % 3) as usize);
+    let tiles = (0..2).flat_map(|scene| grid().render_order().into_iter().map(move |t| (scene, t)));
+    let mut chance = Chance {
+        random: SplitMix64(seed),
+        post: Vec::new(),
+        member: None,
+        member_count: 0,
+        free: tiles.collect(),
+        leases: BTreeMap::new(),
+        lease_count: 0,
+        delivered: BTreeSet::new(),
+    };
+    let mut posted = BTreeSet::new();
+    for _ in 0..50_000 {
+        for (&task, call) in &bench.calls {
+            if posted.insert(task) && !chance.random.is_one_in(10) {
+                chance.post(bench.now, Letter::Question(task, call.clone()));
+            }
+        }
+        for (&task, &scene) in &bench.fetches {
+            if posted.insert(task) {
+                chance.post(bench.now, Letter::Fetched(task, scene));
+            }
+        }
+        for &task in bench.renderings.keys() {
+            if posted.insert(task) {
+                chance.post(bench.now, Letter::Rendered(task));
+                chance.post(bench.now, Letter::Beat);
+            }
+        }
+        if let Some(exit) = bench.exit {
+            assert_eq!(exit, Ok(()), "seed {seed}");
+            assert_eq!(chance.delivered.len(), 2 * grid().count() as usize, "seed {seed}");
+            return;
+        }
+
+        let is_in_time = |arrival| bench.worker.wake_at().is_none_or(|wake| arrival < wake);
+        let first = (0..chance.post.len()).min_by_key(|&index| chance.post[index].0);
+        let Some(first) = first.filter(|&index| is_in_time(chance.post[index].0)) else {
+            bench.sleep();
+            continue;
+        };
+        let (arrival, letter) = chance.post.swap_remove(first);
+        bench.now = bench.now.max(arrival);
+        match letter {
+            Letter::Question(task, call) => {
+                let answer = chance.on_question(call);
+                if !chance.random.is_one_in(10) {
+                    chance.post(bench.now, Letter::Answer(task, answer));
+                }
+            }
+            Letter::Answer(task, answer) => {
+                // The worker may have stopped waiting, and is told all the same.
+                bench.calls.remove(&task);
+                match answer {
+                    Ok(answer) => bench.worker.on_answer(task, answer, bench.now),
+                    Err(error) => bench.worker.on_call_failed(task, error, bench.now),
+                }
+            }
+            Letter::Fetched(task, scene) => {
+                if bench.fetches.remove(&task).is_some() {
+                    bench.scenes.push(scene);
+                }
+                bench.worker.on_fetched(task, bench.now);
+            }
+            Letter::Rendered(task) => {
+                let (lease, tile) = bench.renderings.remove(&task).unwrap();
+                let pixels = (!bench.stopped.remove(&task)).then(|| delivery(lease, tile));
+                bench.worker.on_tile_rendered(task, pixels, bench.now);
+            }
+            Letter::Beat => bench.worker.on_beat(bench.now),
+        }
+        bench.absorb();
+    }
+    panic!("seed {seed}: no end");
+}
+
+#[test]
+fn every_tile_is_delivered_though_calls_are_lost_and_leases_and_members_forgotten() {
+    for seed in 0..500 {
+        simulate(seed);
+    }
+}
