@@ -188,7 +188,7 @@ const ROOMS: [(&str, &[&str]); 13] = [
     ("light", &["exact", "prepared", "trace", "shade"]),
     ("render", &["exact", "prepared", "trace", "shade", "light"]),
     // A door for tests and benchmarks: nobody may import it.
-    ("testing", &["scene", "prepared", "prepare", "trace"]),
+    ("testing", &["prepare", "trace"]),
     ("lib", &[]),
 ];
 

@@ -19,7 +19,7 @@ use rtfarm_core::{
     prepared::{PreparedBytes, PreparedScene},
     read::read_scene,
     render::{Quality, RenderedTile, Sampling, Settings, render_tile},
-    testing::prepare_without_emitter_records,
+    testing::prepare_with,
     tile::{Area, Size},
 };
 
@@ -55,7 +55,7 @@ fn ways(name: &str) -> [(&'static str, Block); 2] {
     let scene = read_scene(&text, &nothing).scene.expect("a scene without a fault");
     let open = |bytes| PreparedScene::open(bytes).expect("a valid block");
     [
-        ("spread", open(prepare_without_emitter_records(&scene).expect("a scene"))),
+        ("spread", open(prepare_with(&scene, false).expect("a scene"))),
         ("aimed", open(prepare(&scene).expect("a scene"))),
     ]
 }

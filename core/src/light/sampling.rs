@@ -56,7 +56,7 @@ pub(super) fn sample_light(
     receiver: &Receiver,
     numbers: &GatherNumbers,
 ) -> Option<LightSample> {
-    // Nothing on record can be aimed at.
+    // No emitter on record can be chosen.
     if view.emitters.is_empty() {
         return sample_hemisphere(receiver, 1.0, numbers.direction());
     }

@@ -2,7 +2,7 @@
 
 use glam::DVec3;
 
-use super::{PrepareError, flat::bounds_of, sort::Sorted};
+use super::{error::PrepareError, flat::bounds_of, sort::Sorted};
 use crate::{
     prepared::{
         face::triangle_normal,

@@ -10,6 +10,7 @@ mod collect;
 mod emitter_tree;
 mod emitters;
 mod equal_spheres;
+mod error;
 mod features;
 mod flat;
 mod hierarchy;
@@ -30,6 +31,7 @@ mod weld;
 
 use glam::DVec3;
 
+pub use self::error::PrepareError;
 use self::{
     collect::Collected, emitters::Emitters, features::features, hierarchy::Hierarchy,
     lights::Lights, ranks::Ranks, scale::extent_of_eye_and_lights, textures::Textures,
@@ -38,25 +40,10 @@ use crate::{
     prepared::{
         bytes::{PreparedBytes, assemble},
         layout::Sections,
-        node::Child,
         record::{Camera, Lighting},
     },
     scene::{Scene, Viewport},
 };
-
-/// Why a scene cannot be prepared.
-#[derive(Debug, Clone, PartialEq, thiserror::Error)]
-pub enum PrepareError {
-    /// There is nothing to look through.
-    #[error("a picture needs a `viewport` block with origin, topleft, bottomleft and topright")]
-    NoViewport,
-    /// The scene has more faces than indices reach.
-    #[error("the scene has {0} faces; at most {limit} can be rendered", limit = Child::ITEM_LIMIT)]
-    TooManyFaces(u64),
-    /// A light that, seen in the scene's own units, is no finite number.
-    #[error("light {0} (counted from 1) is too strong for numbers to hold")]
-    Light(usize),
-}
 
 /// Turns a scene into a prepared scene, on rayon's threads; the same scene gives the same bytes on
 /// any number of them.
@@ -66,7 +53,7 @@ pub fn prepare(scene: &Scene) -> Result<PreparedBytes, PrepareError> {
 
 /// The same. Without records of the emitters, light that faces send on is looked for over the
 /// whole hemisphere alone.
-pub(crate) fn prepare_with(
+pub fn prepare_with(
     scene: &Scene,
     keeps_emitter_records: bool,
 ) -> Result<PreparedBytes, PrepareError> {

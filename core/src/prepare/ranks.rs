@@ -2,7 +2,7 @@
 
 use std::collections::HashMap;
 
-use super::PrepareError;
+use super::error::PrepareError;
 use crate::{
     prepared::node::Child,
     scene::{Scene, SolidNode},
