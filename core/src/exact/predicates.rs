@@ -176,7 +176,7 @@ fn is_simple(corners: &[DVec3; 4], normal: DVec3, triples: &[[DVec3; 3]; 4]) -> 
 }
 
 /// A point as the coordinate axis `axis` sees it, counter-clockwise staying so.
-pub(crate) fn project(axis: usize, point: DVec3) -> DVec2 {
+pub(super) fn project(axis: usize, point: DVec3) -> DVec2 {
     match axis {
         0 => DVec2::new(point.y, point.z),
         1 => DVec2::new(point.z, point.x),
@@ -233,7 +233,7 @@ fn decode(number: f64) -> (i64, i32) {
 }
 
 /// The exponent that makes `number` · 2^-exponent lie in 0.5..1; 0 for zero.
-pub(crate) fn exponent(number: f64) -> i32 {
+pub(super) fn exponent(number: f64) -> i32 {
     let (mantissa, exponent) = decode(number);
     if mantissa == 0 {
         0
@@ -243,7 +243,7 @@ pub(crate) fn exponent(number: f64) -> i32 {
 }
 
 /// `number` · 2^power.
-pub(crate) fn scale_by_power(mut number: f64, mut power: i32) -> f64 {
+pub(super) fn scale_by_power(mut number: f64, mut power: i32) -> f64 {
     const STEP: i32 = 1000;
     let power_of_two = |power: i32| f64::from_bits(((1023 + power) as u64) << 52);
     while power > STEP {

@@ -26,7 +26,7 @@ pub(super) struct LightCut {
 impl LightCut {
     /// Cuts the tree for a receiver: from the root on, the most important node is opened until
     /// there are [`MOST_NODES`]. Where there are no more emitters than that, each is a node.
-    pub(super) fn new(view: &View<'_>, receiver: &Receiver) -> Self {
+    pub(crate) fn new(view: &View<'_>, receiver: &Receiver) -> Self {
         let mut cut = Self {
             nodes: [0; MOST_NODES],
             irradiances: [0.0; MOST_NODES],

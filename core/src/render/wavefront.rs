@@ -346,7 +346,7 @@ impl Wavefront {
     fn light(&mut self, view: &View<'_>, index: usize, isa: Isa) -> u64 {
         let light = &view.lights[index];
         let [position, intensity] = [light.position, light.intensity].map(DVec3::from_array);
-        let touches = view.coincident_surfaces(light);
+        let on_light = view.coincident_surfaces(light);
         self.shadow_rays.clear();
         self.arrivals.clear();
         for (k, point) in self.points.iter().enumerate() {
@@ -354,7 +354,7 @@ impl Wavefront {
             let height = point.normal.dot(to_light);
             // Where the light is on the surface the height is rounding, but the distance may be
             // as small.
-            if height > 0.0 && !touches.contains(&point.surface) {
+            if height > 0.0 && !on_light.contains(&point.surface) {
                 let distance = to_light.length();
                 self.arrivals.push((k, intensity * (height / (distance * distance * distance))));
                 self.shadow_rays.push(Ray {

@@ -27,7 +27,7 @@ pub(super) struct Chart {
 impl Chart {
     /// Makes the chart of a face with three corners or four, counter-clockwise seen from where
     /// `normal` points.
-    pub(super) fn new(corners: &[DVec3], normal: DVec3) -> Self {
+    pub(crate) fn new(corners: &[DVec3], normal: DVec3) -> Self {
         let from_first = |k: usize| corners[k] - corners[0];
         let extent =
             (1..corners.len()).map(|k| from_first(k).abs().max_element()).fold(0.0, f64::max);

@@ -19,7 +19,7 @@ pub(crate) struct Interaction<'a> {
     /// The distance from the ray's origin, in units of its direction.
     pub(crate) t: f64,
     pub(crate) position: DVec3,
-    pub(crate) face: Face,
+    pub(super) face: Face,
     pub(crate) rank: u32,
     pub(crate) surface: Surface,
     pub(crate) material: &'a MaterialRecord,
@@ -91,7 +91,7 @@ pub(crate) struct Point {
     /// What the surface's own light counts in the sample.
     pub(crate) weight: f64,
     pub(crate) position: DVec3,
-    /// Of length 1, towards the side that is seen.
+    /// The unit normal towards the side that is seen.
     pub(crate) normal: DVec3,
     pub(crate) surface: Surface,
     pub(crate) color: DVec3,

@@ -67,7 +67,7 @@ pub(super) struct TextureView<'a> {
 
 impl<'a> TextureView<'a> {
     /// Looks at the image of an index.
-    pub(super) fn new(view: &View<'a>, index: u32) -> Self {
+    pub(crate) fn new(view: &View<'a>, index: u32) -> Self {
         Self {
             levels: &view.texture_levels[view.textures[index as usize].levels()],
             fine: view.fine_texels,

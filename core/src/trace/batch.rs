@@ -35,11 +35,11 @@ pub(crate) fn trace_shadows(
     shares: &mut Vec<f64>,
 ) {
     shares.clear();
-    let touches = view.coincident_surfaces(light);
+    let ending_on = view.coincident_surfaces(light);
     if view.header.features.has_clear_shadows() {
-        run_with_kernel(isa, &mut ClearShadows { view, rays, touches, shares });
+        run_with_kernel(isa, &mut ClearShadows { view, rays, ending_on, shares });
     } else {
-        run_with_kernel(isa, &mut Shadows { view, rays, touches, shares });
+        run_with_kernel(isa, &mut Shadows { view, rays, ending_on, shares });
     }
 }
 
@@ -69,7 +69,7 @@ impl KernelWork for Trace<'_> {
 struct Shadows<'a> {
     view: &'a View<'a>,
     rays: &'a [Ray],
-    touches: &'a [Surface],
+    ending_on: &'a [Surface],
     shares: &'a mut Vec<f64>,
 }
 
@@ -82,7 +82,7 @@ impl KernelWork for Shadows<'_> {
             let shear = Shear::new(ray.origin, ray.direction);
             let mut is_blocked = false;
             visit(kernel, view, ray, &mut stack, |item| {
-                between(view, ray, &shear, self.touches, item, &mut scratch, |_, _| {
+                between(view, ray, &shear, self.ending_on, item, &mut scratch, |_, _| {
                     is_blocked = true;
                 });
                 if is_blocked { Step::Enough } else { Step::On(ray.reach) }
@@ -96,7 +96,7 @@ impl KernelWork for Shadows<'_> {
 struct ClearShadows<'a> {
     view: &'a View<'a>,
     rays: &'a [Ray],
-    touches: &'a [Surface],
+    ending_on: &'a [Surface],
     shares: &'a mut Vec<f64>,
 }
 
@@ -111,7 +111,7 @@ impl KernelWork for ClearShadows<'_> {
             crossed.clear();
             let mut is_blocked = false;
             visit(kernel, view, ray, &mut stack, |item| {
-                between(view, ray, &shear, self.touches, item, &mut scratch, |rank, part| {
+                between(view, ray, &shear, self.ending_on, item, &mut scratch, |rank, part| {
                     let share = Face { item, part }.material(view).transmittance();
                     is_blocked |= share == 0.0;
                     crossed.push((rank, share));

@@ -40,7 +40,7 @@ const NEAR: f64 = 2.0 * f32::EPSILON as f64;
 
 impl BoxRay {
     #[inline(always)]
-    pub(super) fn new(origin: DVec3, direction: DVec3, reach: f64, frame: &Frame) -> Self {
+    pub(crate) fn new(origin: DVec3, direction: DVec3, reach: f64, frame: &Frame) -> Self {
         let mut relative = (origin - DVec3::from_array(frame.origin)) * frame.scale;
         // Seen from afar the scene is a speck in f32: start where it begins. All of it lies
         // within sqrt(3) of the frame's origin.

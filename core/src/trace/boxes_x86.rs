@@ -15,7 +15,7 @@ use crate::prepared::node::Node;
 pub(super) struct Sse2Boxes(());
 
 impl Sse2Boxes {
-    pub(super) fn new() -> Self {
+    pub(crate) fn new() -> Self {
         Self(())
     }
 }
