@@ -52,7 +52,8 @@ pub fn prepare(scene: &Scene) -> Result<PreparedBytes, PrepareError> {
 }
 
 /// The same. Without records of the emitters, light that faces send on is looked for over the
-/// whole hemisphere alone.
+/// whole hemisphere alone: the noisier way that benchmarks compare with.
+#[doc(hidden)]
 pub fn prepare_with(
     scene: &Scene,
     keeps_emitter_records: bool,
