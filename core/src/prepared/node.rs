@@ -74,7 +74,7 @@ impl Child {
 
 impl Node {
     /// The index of the node that all others descend from.
-    pub(crate) const ROOT: usize = 0;
+    pub(super) const ROOT: usize = 0;
 
     /// A node without children.
     pub(crate) const EMPTY: Self = {

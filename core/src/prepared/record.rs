@@ -2,7 +2,7 @@
 
 use std::ops::Range;
 
-use glam::DVec3;
+use glam::{DVec2, DVec3};
 
 use crate::{exact::float::power_of_two_below_inverse, left_out, transfer::Transfer};
 
@@ -509,6 +509,26 @@ impl TexturedFace {
 #[derive(Debug, Clone, Copy, PartialEq, bytemuck::Pod, bytemuck::Zeroable)]
 #[repr(transparent)]
 pub(crate) struct Texcoords(pub(crate) [[f64; 2]; 4]);
+
+impl Texcoords {
+    /// Those of a face that was given none. A triangle's corners are the first, the second and the
+    /// last.
+    pub(crate) const DEFAULT: Self = Self([[0.0, 1.0], [1.0, 1.0], [1.0, 0.0], [0.0, 0.0]]);
+
+    /// Beyond this a number has no fraction, so an image that repeats has no place there.
+    const LARGEST: f64 = (1_u64 << 53) as f64;
+
+    /// Makes those of a quadrangle with these at its corners.
+    pub(crate) fn of_quadrangle(corners: [DVec2; 4]) -> Self {
+        let limit = DVec2::splat(Self::LARGEST);
+        Self(corners.map(|corner| corner.clamp(-limit, limit).to_array()))
+    }
+
+    /// Makes those of a triangle with these at its corners.
+    pub(crate) fn of_triangle([a, b, c]: [DVec2; 3]) -> Self {
+        Self::of_quadrangle([a, b, b + (c - a), c])
+    }
+}
 
 /// An image: a run of levels.
 #[derive(Debug, Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
