@@ -6,14 +6,13 @@
 use std::{ops::ControlFlow, sync::LazyLock};
 
 use rtfarm_core::{
+    assets::{mesh::read_mesh, texture::read_texture},
     isa::Isa,
-    mesh_file::read_mesh,
+    language::{Severity, Style, draw_diagnostics, read_scene},
     prepare::prepare,
     prepared::{PreparedBytes, PreparedError, PreparedScene},
-    read::{Severity, Style, draw_diagnostics, read_scene},
     render::{Cutoff, Quality, Sampling, render_tile},
     scene::{MeshVertices, Scene, SolidNode},
-    texture::read_texture,
     tile::{Area, Size},
 };
 

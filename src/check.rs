@@ -8,9 +8,9 @@ use std::{
 use anyhow::Context;
 use rtfarm_core::{
     isa::Isa,
+    language::{Diagnostic, Reading, Severity, draw_diagnostics, read_scene},
     prepare::prepare,
     prepared::PreparedScene,
-    read::{Diagnostic, Reading, Severity, draw_diagnostics, read_scene},
     scene::Scene,
 };
 use serde_json::{Value, json};

@@ -7,7 +7,7 @@ use std::{
 };
 
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
-use rtfarm_core::read::Style;
+use rtfarm_core::language::Style;
 use rtfarm_job::Progress;
 use tokio::time::Instant;
 use tracing_subscriber::{

@@ -12,7 +12,7 @@ use std::{
 use anyhow::{Context, anyhow};
 use rtfarm_coordinator::{Config, Coordinator, Job, Listener};
 use rtfarm_core::{
-    read::draw_diagnostics,
+    language::draw_diagnostics,
     render::{Sampling, Tally},
     tile::Size,
     transfer::Transfer,

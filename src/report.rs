@@ -9,9 +9,9 @@ use std::{
 
 use anyhow::{Context, anyhow};
 use rtfarm_core::{
+    language::{draw_diagnostics, read_scene},
     prepare::prepare,
     prepared::{PreparedBytes, PreparedScene},
-    read::{draw_diagnostics, read_scene},
     tile::Size,
 };
 use rtfarm_ladder::{Ladder, Report, Subject};

@@ -5,13 +5,12 @@ use std::{
     fs::{self, File, Metadata},
     io::{self, Read},
     path::{Path, PathBuf},
-    sync::Mutex,
     time::SystemTime,
 };
 
 use anyhow::Context;
 use memmap2::Mmap;
-use rtfarm_core::read::read_scene;
+use rtfarm_core::language::referenced_files;
 use tokio::task::spawn_blocking;
 use tokio_util::sync::CancellationToken;
 
@@ -110,16 +109,6 @@ pub(crate) fn scene_folder(scene: &SceneArgs) -> PathBuf {
 pub(crate) fn read_named_files(text: &[u8], folder: &Path) -> BTreeMap<String, Vec<u8>> {
     let read = |name: String| Some((fs::read(folder.join(&name)).ok()?, name));
     referenced_files(text).into_iter().filter_map(read).map(|(data, name)| (name, data)).collect()
-}
-
-/// The names that a scene has for files: what its reader asks for, of which nothing is decoded.
-fn referenced_files(text: &[u8]) -> Vec<String> {
-    let names = Mutex::new(Vec::new());
-    read_scene(text, &|name: &str| {
-        names.lock().expect("nothing here panics").push(name.to_owned());
-        Err(io::ErrorKind::NotFound.into())
-    });
-    names.into_inner().expect("nothing here panics")
 }
 
 #[cfg(test)]

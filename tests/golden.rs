@@ -15,9 +15,9 @@ use image::{ImageBuffer, Rgb};
 use rayon::prelude::*;
 use rtfarm_core::{
     isa::Isa,
+    language::read_scene,
     prepare::prepare,
     prepared::PreparedScene,
-    read::read_scene,
     render::{Quality, Sampling, Settings, render_tile},
     tile::{Area, Size},
     transfer::Transfer,

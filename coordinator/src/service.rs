@@ -10,7 +10,7 @@ use std::{
 };
 
 use rtfarm_core::{
-    read::{Style, draw_diagnostics},
+    language::{Style, draw_diagnostics},
     render::Tally,
     tile::Size,
 };

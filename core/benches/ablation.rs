@@ -22,9 +22,9 @@ use std::{
 
 use rtfarm_core::{
     isa::Isa,
+    language::read_scene,
     prepare::prepare,
     prepared::{PreparedBytes, PreparedScene},
-    read::read_scene,
     render::{Quality, Sampling, render_tile},
     testing::{self, BUILT_WITHOUT},
     tile::{Area, Size},

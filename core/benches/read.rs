@@ -11,7 +11,7 @@
 
 use std::{env, fmt::Write, fs, io, process::Command, time::Instant};
 
-use rtfarm_core::{mesh_file::read_mesh, read::read_scene};
+use rtfarm_core::{assets::mesh::read_mesh, language::read_scene};
 
 /// Rows of the sphere's grid; a row has twice as many cells, a cell two triangles.
 const ROWS: usize = 500;

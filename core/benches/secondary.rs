@@ -15,9 +15,9 @@ use std::{env, fs, ops::ControlFlow, path::Path, time::Instant};
 
 use rtfarm_core::{
     isa::Isa,
+    language::read_scene,
     prepare::prepare,
     prepared::{PreparedBytes, PreparedScene},
-    read::read_scene,
     render::{Quality, RenderedTile, Sampling, Settings, render_tile},
     testing::prepare_with,
     tile::{Area, Size},

@@ -29,6 +29,3 @@ mod trace;
 
 #[doc(hidden)]
 pub mod testing;
-
-pub use assets::{mesh as mesh_file, texture};
-pub use language::reader as read;

@@ -1,5 +1,5 @@
 //! A scene as its author wrote it, checked: every number is finite, every reference resolves,
-//! every shape has the extent that its type promises. Only [`crate::read`] makes one from text;
+//! every shape has the extent that its type promises. Only [`crate::language`] makes one from text;
 //! whoever makes one by hand keeps the invariants written at each field.
 
 use std::{fmt, sync::Arc};
@@ -11,11 +11,11 @@ use crate::{tile::Size, transfer::Transfer};
 /// A whole scene. Colours are red, green and blue light, 1.0 where the file says 255.
 #[derive(Debug, Clone, Default)]
 pub struct Scene {
-    /// Eye and screen; a scene without them can be checked but not rendered.
+    /// The eye and the screen; a scene without them can be checked but not rendered.
     pub viewport: Option<Viewport>,
     /// The size in pixels that the file asks for.
     pub size_hint: Option<Size>,
-    /// Seen where nothing is hit. Components >= 0.
+    /// The light that is seen where nothing is hit. Components >= 0.
     pub background: DVec3,
     /// Uniform light on everything; `None` where the file defines none. Components >= 0.
     pub ambient: Option<DVec3>,
@@ -43,12 +43,12 @@ pub struct Scene {
     pub solids: Vec<Solid>,
     /// Triangle meshes, in file order.
     pub meshes: Vec<Mesh>,
-    /// What the file held and the scene does not.
-    pub dropped: Dropped,
+    /// The faces that the file holds and the scene does not.
+    pub dropped: DroppedFaces,
 }
 
 impl Scene {
-    /// What a picture may need of the tracer, and whether one of this scene does.
+    /// Lists what a picture may need of the tracer, and whether one of this scene does.
     pub fn needs(&self) -> [(&'static str, bool); 9] {
         let any = |holds: fn(&Material) -> bool| self.materials.iter().any(holds);
         [
@@ -65,12 +65,13 @@ impl Scene {
     }
 }
 
-/// Faces that were left out because they cannot be seen or stand there twice.
+/// Counts of the faces that were left out because they cannot be seen or are copies of others.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub struct Dropped {
-    /// Triangles of zero area.
+pub struct DroppedFaces {
+    /// The number of triangles of zero area.
     pub zero_area: u64,
-    /// Exact copies of an earlier triangle: same vertices in cyclic order, material and texcoords.
+    /// The number of exact copies of an earlier triangle: of the same vertices in cyclic order, the
+    /// same material and the same texture coordinates.
     pub duplicates: u64,
 }
 
@@ -92,7 +93,7 @@ impl fmt::Display for Place {
 /// The eye and the screen. The corners are not collinear and the eye is not in their plane.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Viewport {
-    /// Where all camera rays start.
+    /// The point where all camera rays start.
     pub eye: DVec3,
     /// The outer corner of the first pixel of the first row.
     pub top_left: DVec3,
@@ -103,8 +104,8 @@ pub struct Viewport {
 }
 
 impl Viewport {
-    /// The size of a picture where nobody asked for one: 1280 pixels wide, with square pixels as
-    /// nearly as whole rows allow.
+    /// Gives the size of a picture where nobody asked for one: 1280 pixels wide, with square pixels
+    /// as nearly as whole rows allow.
     pub fn default_size(&self) -> Size {
         let (left, top) = (self.bottom_left - self.top_left, self.top_right - self.top_left);
         let height = (1280.0 * (left.length() / top.length())).round();
@@ -115,9 +116,9 @@ impl Viewport {
 /// A point light.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Light {
-    /// Where it is.
+    /// The place of the light.
     pub position: DVec3,
-    /// What a surface facing it receives at distance 1: (power / reference power) ·
+    /// The light that a surface facing it receives at distance 1: (power / reference power) ·
     /// reference distance² · colour. Components >= 0.
     pub intensity: DVec3,
 }
@@ -127,13 +128,14 @@ pub struct Light {
 pub struct Material {
     /// The name that geometry refers to.
     pub name: String,
-    /// Surface colour, components in 0..=1.
+    /// The colour of the surface. Components in 0..=1.
     pub color: DVec3,
-    /// 1 is opaque, 0 clear.
+    /// The opacity: 1 is opaque, 0 is clear.
     pub alpha: f64,
-    /// The mirrored share, 0..=1.
+    /// The share of light that is mirrored, 0..=1.
     pub reflect: f64,
-    /// n1/n2 from the front side to the side behind; 0 does not bend. >= 0.
+    /// The refractive index before the front over that after it, n1/n2, >= 0; 0 does not bend
+    /// light.
     pub refract: f64,
     /// The image that multiplies `color`: an index in [`Scene::textures`].
     pub texture: Option<u32>,
@@ -144,11 +146,11 @@ pub struct Material {
 pub struct Texture {
     /// The path as the scene has it.
     pub path: String,
-    /// Texels in a row, at least 1.
+    /// The number of texels in a row, at least 1.
     pub width: u32,
-    /// Rows of texels, at least 1.
+    /// The number of rows, at least 1.
     pub height: u32,
-    /// Red, green, blue as the file has them, `[y][x]`, the top row first.
+    /// The texels: red, green and blue as the file has them, `[y][x]`, the top row first.
     pub texels: Vec<[u8; 3]>,
 }
 
@@ -157,7 +159,7 @@ pub struct Texture {
 pub struct Sphere {
     /// The centre.
     pub center: DVec3,
-    /// Above 0.
+    /// The radius, above 0.
     pub radius: f64,
     /// An index in [`Scene::materials`].
     pub material: u32,
@@ -193,7 +195,7 @@ pub struct Quadrangle {
 pub struct Parallelepiped {
     /// A corner.
     pub corner: DVec3,
-    /// From the corner to its three neighbours.
+    /// The edges from the corner to its three neighbours.
     pub edges: [DVec3; 3],
     /// An index in [`Scene::materials`].
     pub material: u32,
@@ -201,11 +203,11 @@ pub struct Parallelepiped {
     pub primitive: u32,
 }
 
-/// A constructive solid: its nodes in postfix order, so that operands stand before the operation
+/// A constructive solid: its nodes in postfix order, so that operands come before the operation
 /// that joins them and the last node is the root.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Solid {
-    /// Postfix.
+    /// The nodes in postfix order.
     pub nodes: Vec<SolidNode>,
     /// The place among all primitives of the file, from 0.
     pub primitive: u32,
@@ -220,9 +222,9 @@ pub enum SolidNode {
     Parallelepiped(Parallelepiped),
     /// Joins the last `operands` (>= 2) results.
     Operation {
-        /// How.
+        /// The operation.
         operation: Operation,
-        /// How many results it joins.
+        /// The number of results that it joins.
         operands: u32,
     },
 }
@@ -230,11 +232,11 @@ pub enum SolidNode {
 /// A set operation; `Difference` is the first operand less all others.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Operation {
-    /// In any.
+    /// What is in any operand.
     Union,
-    /// In all.
+    /// What is in all operands.
     Intersection,
-    /// In the first and in no other.
+    /// What is in the first operand and in no other.
     Difference,
 }
 
@@ -244,13 +246,14 @@ pub enum Operation {
 pub struct Mesh {
     /// The path as the scene has it.
     pub path: String,
-    /// Before the transform. All meshes of one file share it.
+    /// The mesh before the transform. All meshes of one file share it.
     pub shape: Arc<MeshShape>,
-    /// Applied first. Above 0.
+    /// The factor that is applied first, above 0.
     pub scale: f64,
-    /// Applied second: an axis, not zero, and an angle in degrees, right-handed.
+    /// The rotation that is applied second: an axis, not zero, and an angle in degrees,
+    /// right-handed.
     pub rotate: Option<(DVec3, f64)>,
-    /// Applied last.
+    /// The translation that is applied last.
     pub offset: DVec3,
     /// An index in [`Scene::materials`].
     pub material: u32,
@@ -258,13 +261,13 @@ pub struct Mesh {
     pub primitive: u32,
 }
 
-/// What a mesh file holds.
+/// The faces of a mesh file.
 #[derive(Debug, Clone, PartialEq)]
 pub struct MeshShape {
     /// The corners that triangles share, no two in one place.
     pub vertices: MeshVertices,
-    /// Indices of corners, counter-clockwise seen from the front. At least one; of an area above
-    /// zero, each only once.
+    /// Triangles as indices of corners, counter-clockwise seen from the front. There is at least
+    /// one; each has an area above zero and is there only once.
     pub triangles: Vec<[u32; 3]>,
 }
 
@@ -273,6 +276,6 @@ pub struct MeshShape {
 pub enum MeshVertices {
     /// Every coordinate fits in f32 exactly.
     Single(Vec<[f32; 3]>),
-    /// Some do not.
+    /// Some coordinates do not.
     Double(Vec<[f64; 3]>),
 }

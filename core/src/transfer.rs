@@ -3,27 +3,27 @@
 //!
 //! Source: IEC 61966-2-1 (1999), the sRGB standard.
 
-/// What a colour's numbers say of its light; 1 is full on both sides.
+/// The relation of a colour's numbers to its light; 1 is full on both sides.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
 pub enum Transfer {
-    /// They are the light.
+    /// The numbers are the light.
     #[default]
     None,
-    /// They are encoded by the sRGB curve, which goes on above 1 by its formula.
+    /// The numbers are encoded by the sRGB curve, which goes on above 1 by its formula.
     Srgb,
 }
 
-/// Where the curve is a straight line near black.
+/// The slope of the curve near black, where it is a straight line, and the ends of that line.
 const SLOPE: f64 = 12.92;
 const LINE_ENDS_AT: f64 = 0.040_45;
 const LINE_ENDS_AT_LIGHT: f64 = 0.003_130_8;
 
-/// Elsewhere the light is ((c + offset) / (1 + offset))^2.4.
+/// The offset of the curve elsewhere: the light is ((c + offset) / (1 + offset))^2.4.
 const OFFSET: f64 = 0.055;
 
 impl Transfer {
-    /// The light that a colour's number stands for. The number must not be negative; above 1e128
-    /// the light may not be finite.
+    /// Gives the light that a colour's number stands for. The number must not be negative; above
+    /// 1e128 the light may not be finite.
     pub const fn decode(self, number: f64) -> f64 {
         match self {
             Self::None => number,
@@ -36,7 +36,7 @@ impl Transfer {
         }
     }
 
-    /// The number that stands for an amount of light, which must lie in `0..=1`.
+    /// Gives the number that stands for an amount of light, which must lie in `0..=1`.
     pub fn encode(self, light: f64) -> f64 {
         match self {
             Self::None => light,
@@ -50,8 +50,8 @@ impl Transfer {
         }
     }
 
-    /// The light that each 8-bit number stands for, in 255ths: so sums are exact where numbers are
-    /// the light.
+    /// Gives the light that each 8-bit number stands for, in 255ths, so that sums are exact where
+    /// numbers are the light.
     pub(crate) fn light_of_bytes(self) -> &'static [f64; 256] {
         static NONE: [f64; 256] = light_of_bytes(Transfer::None);
         static SRGB: [f64; 256] = light_of_bytes(Transfer::Srgb);
@@ -75,8 +75,8 @@ const fn light_of_bytes(transfer: Transfer) -> [f64; 256] {
     table
 }
 
-/// The `N`th root of a normal number above 0 by Newton's method, in operations that round alike
-/// everywhere. Within 2 units in the last place for 3 and 5.
+/// Computes the `N`th root of a normal number above 0 by Newton's method, in operations that round
+/// alike everywhere. It is within 2 units in the last place for 3 and 5.
 const fn root<const N: u32>(x: f64) -> f64 {
     // The exponent through N: less than 7 % off. Each step makes of an error e one of (N - 1)/2 e².
     let one = 1.0_f64.to_bits();

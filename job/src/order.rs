@@ -1,9 +1,9 @@
 //! An order: from a scene's text to what a job needs.
 
 use rtfarm_core::{
+    language::{Diagnostic, Omitted, Reading, Resolve, read_scene_with},
     prepare::{PrepareError, prepare},
     prepared::PreparedBytes,
-    read::{Diagnostic, Omitted, Reading, Resolve, read_scene_with},
     render::{Quality, Settings},
     scene::Scene,
     tile::{Size, TileGrid},

@@ -9,9 +9,9 @@ use std::{
 
 use rtfarm_core::{
     isa::Isa,
+    language::read_scene,
     prepare::prepare,
     prepared::PreparedScene,
-    read::read_scene,
     render::{Quality, Sampling, render_tile},
     tile::{Area, Size},
     transfer::Transfer,

@@ -10,7 +10,7 @@ use crate::scene::Texture;
 #[derive(Debug, thiserror::Error)]
 pub enum TextureError {
     /// Neither its bytes nor its name are those of a format.
-    #[error("it is no PNG, JPEG, BMP, TGA or WebP file")]
+    #[error("it is not a PNG, JPEG, BMP, TGA or WebP file")]
     UnknownFormat,
     /// It is broken.
     #[error("{0}")]
@@ -19,7 +19,7 @@ pub enum TextureError {
     #[error("it has no texels")]
     Empty,
     /// It would take memory out of all proportion to its file.
-    #[error("it has {width} x {height} texels in {bytes} bytes: a bomb")]
+    #[error("it has {width} x {height} texels in only {bytes} bytes, which no real image has")]
     Bomb {
         /// Its width in texels.
         width: u32,
@@ -30,7 +30,7 @@ pub enum TextureError {
     },
     /// It would take too much memory.
     #[error(
-        "it has {width} x {height} texels; at most {MOST_TEXELS} are read, in sides of at most {LONGEST_SIDE}"
+        "it has {width} x {height} texels; at most {MOST_TEXELS} are allowed, in sides of at most {LONGEST_SIDE}"
     )]
     TooLarge {
         /// Its width in texels.
@@ -55,7 +55,7 @@ const MOST_TEXELS_A_BYTE: u64 = 400;
 /// The memory that a decoder may take besides.
 const MOST_BYTES: u64 = 1 << 30;
 
-/// Decodes the bytes of an image file. They tell the format; of TGA, which has no mark, the name
+/// Decodes the bytes of an image file. They tell the format, except that TGA has no mark: its name
 /// does.
 pub fn read_texture(path: &str, bytes: &[u8]) -> Result<Texture, TextureError> {
     let format = match image::guess_format(bytes) {

@@ -1,20 +1,34 @@
-//! Hashes of coordinates for tables of indices. Nobody can write a file whose hashes collide, as
-//! the key differs from run to run; what is kept does not hang on it.
+//! Hashes of numbers for tables of indices. What is kept does not depend on them.
 
-use std::hash::{BuildHasher, RandomState};
+use std::hash::{BuildHasher, Hasher, RandomState};
 
-/// A key that cannot be foreseen.
-pub(crate) fn random_key() -> u64 {
-    RandomState::new().hash_one(0)
+use foldhash::{SharedSeed, fast::FoldHasher};
+
+/// A hash function that differs from run to run: nobody can write a file of which many hashes
+/// collide. The seeds come from the standard library, which takes them from the system; foldhash's
+/// own would come from addresses and a clock.
+#[derive(Debug, Clone)]
+pub(crate) struct HashFunction {
+    start: u64,
+    seed: SharedSeed,
 }
 
-/// Mixes `word` into a hash: both halves of a product, which hang on all bits of both factors.
-pub(crate) fn mix(hash: u64, word: u64) -> u64 {
-    let product = u128::from(hash ^ word) * 0x9e37_79b9_7f4a_7c15;
-    (product as u64) ^ (product >> 64) as u64
-}
+impl HashFunction {
+    /// Chooses a function that cannot be foreseen.
+    pub(crate) fn random() -> Self {
+        let random = RandomState::new();
+        Self { start: random.hash_one(0), seed: SharedSeed::from_u64(random.hash_one(1)) }
+    }
 
-/// Half a hash as a whole one: tables take the place from the low bits and a tag from the high.
-pub(crate) fn spread(half: u32) -> u64 {
-    u64::from(half) | u64::from(half) << 32
+    /// The hash of some words in their order.
+    pub(crate) fn hash(&self, words: impl IntoIterator<Item = u64>) -> u64 {
+        self.extend(self.start, words)
+    }
+
+    /// The hash of the words of an earlier `hash` and some more.
+    pub(crate) fn extend(&self, hash: u64, words: impl IntoIterator<Item = u64>) -> u64 {
+        let mut hasher = FoldHasher::with_seed(hash, &self.seed);
+        words.into_iter().for_each(|word| hasher.write_u64(word));
+        hasher.finish()
+    }
 }

@@ -59,17 +59,17 @@ pub(crate) fn triangulate(points: &[DVec3], mut emit: impl FnMut([usize; 3])) ->
     true
 }
 
-/// Newell's normal of a polygon: twice its area, towards the side that sees it counter-clockwise.
-/// Source: Sutherland, Sproull & Schumacker, "A Characterization of Ten Hidden-Surface
-/// Algorithms" (1974), who credit M. E. Newell. Taken about the first corner, so that it does not
-/// lose digits far from the origin.
+/// Computes Newell's normal of a polygon: twice its area, towards the side that sees it
+/// counter-clockwise. Source: Sutherland, Sproull & Schumacker, "A Characterization of Ten
+/// Hidden-Surface Algorithms" (1974), who credit M. E. Newell. Taken about the first corner, so
+/// that it does not lose digits far from the origin.
 fn newell_normal(points: &[DVec3]) -> DVec3 {
     let from_first = |k: usize| points[k] - points[0];
     (1..points.len() - 1).map(|k| from_first(k).cross(from_first(k + 1))).sum()
 }
 
-/// How a, b, c turn: `Greater` to the left. Rounded: files round the corners of their polygons
-/// more than this does.
+/// Tells how a, b, c turn, `Greater` to the left. It is rounded: files round the corners of their
+/// polygons more than this does.
 fn turn(a: DVec2, b: DVec2, c: DVec2) -> Ordering {
     let (u, v) = (b - a, c - a);
     (u.x * v.y).partial_cmp(&(u.y * v.x)).unwrap_or(Ordering::Equal)
@@ -84,7 +84,7 @@ fn is_convex(flat: &[DVec2]) -> bool {
     turns_left && (0..count).filter(|&k| goes_right(k) != goes_right(k + 1)).count() == 2
 }
 
-/// What is left of a polygon while ears are cut off.
+/// The rest of a polygon while its ears are cut off.
 struct Ring<'a> {
     points: &'a [DVec2],
     previous: Vec<usize>,
@@ -134,7 +134,7 @@ impl<'a> Ring<'a> {
         turn(a, b, c) == Ordering::Greater && !self.dents.iter().any(|&dent| blocks(dent))
     }
 
-    /// The first of the `left` corners from `from` on that `is_right`.
+    /// Finds the first of the `left` corners from `from` on that `is_right`.
     fn find(
         &self,
         from: usize,
@@ -149,19 +149,19 @@ impl<'a> Ring<'a> {
     /// Takes a corner out; the answer is one two further on, so that the triangles do not all
     /// meet in one corner.
     fn cut(&mut self, k: usize) -> usize {
-        let (before, behind) = (self.previous[k], self.next[k]);
-        self.next[before] = behind;
-        self.previous[behind] = before;
+        let (before, after) = (self.previous[k], self.next[k]);
+        self.next[before] = after;
+        self.previous[after] = before;
         self.dents.retain(|&dent| dent != k);
-        for corner in [before, behind] {
+        for corner in [before, after] {
             if self.turn_at(corner) == Ordering::Greater {
                 self.dents.retain(|&dent| dent != corner);
             }
         }
-        for corner in [before, behind] {
+        for corner in [before, after] {
             self.is_ear[corner] = self.can_be_cut(corner);
         }
-        self.next[behind]
+        self.next[after]
     }
 }
 

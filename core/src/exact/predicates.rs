@@ -2,6 +2,10 @@
 //! its error bound leaves no doubt, in whole numbers of any length otherwise. No scale is too
 //! small or too large.
 //!
+//! They are written by hand, since packages of predicates decide orientation alone, and only where
+//! no product under- or overflows. The whole numbers are num-bigint's. The oracle in the tests uses
+//! dashu's instead, so that no mistake of one package can hide in both.
+//!
 //! Source of the bounds: Shewchuk, "Adaptive Precision Floating-Point Arithmetic and Fast Robust
 //! Geometric Predicates" (1997), rounded up.
 
@@ -58,7 +62,7 @@ pub(crate) fn is_coplanar(a: DVec3, b: DVec3, c: DVec3, d: DVec3) -> bool {
     is_zero(&dot(&cross(&less(&b, &a), &less(&c, &a)), &less(&d, &a)))
 }
 
-/// How a, b, c turn: `Greater` counter-clockwise, `Equal` not at all.
+/// Tells how a, b, c turn: `Greater` is counter-clockwise, `Equal` not at all.
 fn turn(a: DVec2, b: DVec2, c: DVec2) -> Ordering {
     let (u, v) = (b - a, c - a);
     let (p, q) = (u.x * v.y, u.y * v.x);
@@ -74,9 +78,9 @@ fn turn(a: DVec2, b: DVec2, c: DVec2) -> Ordering {
 /// Why four points are no quadrangle.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) enum QuadrangleFault {
-    /// All are on one line.
+    /// All four are on one line.
     Degenerate,
-    /// Two are in one place.
+    /// Two of them are equal.
     SamePlace,
     /// Two sides meet where they should not.
     Crossing,
@@ -128,8 +132,8 @@ pub(crate) fn check_quadrangle(corners: [DVec3; 4]) -> Result<Option<f64>, Quadr
     }
 }
 
-/// The distance of the corners, scaled by 2^-shift, from the plane of their Newell normal through
-/// their mean. All four have the same: half the distance between the diagonals.
+/// Computes the distance of the corners, scaled by 2^-shift, from the plane of their Newell normal
+/// through their mean. All four have the same: half the distance between the diagonals.
 fn deviation(
     corners: &[DVec3; 4],
     scaled: &[DVec3; 4],
@@ -175,7 +179,7 @@ fn is_simple(corners: &[DVec3; 4], normal: DVec3, triples: &[[DVec3; 3]; 4]) -> 
         && ![[a, b, c], [b, c, d], [c, d, a], [d, a, b]].iter().any(|&[a, b, c]| is_spike(a, b, c))
 }
 
-/// A point as the coordinate axis `axis` sees it, counter-clockwise staying so.
+/// Projects a point along a coordinate axis; counter-clockwise stays so.
 pub(super) fn project(axis: usize, point: DVec3) -> DVec2 {
     match axis {
         0 => DVec2::new(point.y, point.z),
@@ -201,7 +205,7 @@ fn segments_touch([a, b]: [DVec2; 2], [c, d]: [DVec2; 2]) -> bool {
 /// A point in whole multiples of some power of two.
 type Whole = [BigInt; 3];
 
-/// Points as whole numbers of units of 2^the answer's exponent.
+/// Writes points as whole numbers of units of 2^exponent, and gives the exponent.
 fn whole<const N: usize>(points: [DVec3; N]) -> ([Whole; N], i32) {
     let numbers = points.map(|point| point.to_array().map(decode));
     let unit = numbers
@@ -220,7 +224,7 @@ fn whole<const N: usize>(points: [DVec3; N]) -> ([Whole; N], i32) {
     (points, unit)
 }
 
-/// `number` = mantissa · 2^exponent.
+/// Splits `number` into mantissa · 2^exponent.
 fn decode(number: f64) -> (i64, i32) {
     let bits = number.to_bits();
     let fraction = (bits & ((1 << 52) - 1)).cast_signed();
@@ -232,7 +236,7 @@ fn decode(number: f64) -> (i64, i32) {
     (if number.is_sign_negative() { -mantissa } else { mantissa }, exponent + zeros.cast_signed())
 }
 
-/// The exponent that makes `number` · 2^-exponent lie in 0.5..1; 0 for zero.
+/// Finds the exponent that makes `number` · 2^-exponent lie in 0.5..1; it is 0 for zero.
 pub(super) fn exponent(number: f64) -> i32 {
     let (mantissa, exponent) = decode(number);
     if mantissa == 0 {
@@ -242,7 +246,7 @@ pub(super) fn exponent(number: f64) -> i32 {
     }
 }
 
-/// `number` · 2^power.
+/// Multiplies `number` by 2^power.
 pub(super) fn scale_by_power(mut number: f64, mut power: i32) -> f64 {
     const STEP: i32 = 1000;
     let power_of_two = |power: i32| f64::from_bits(((1023 + power) as u64) << 52);
@@ -274,7 +278,7 @@ fn is_zero(number: &BigInt) -> bool {
     number.sign() == Sign::NoSign
 }
 
-/// The quotient of two whole numbers, to some 15 digits; infinite for a divisor of 0.
+/// Divides two whole numbers, to some 15 digits; a divisor of 0 gives infinity.
 fn ratio(dividend: BigUint, divisor: BigUint) -> f64 {
     let leading = |number: BigUint| {
         let excess = number.bits().saturating_sub(64);
@@ -350,9 +354,10 @@ mod tests {
 
     #[test]
     fn bounds_never_decide_what_whole_numbers_do_not() {
-        let mut state = 3;
+        // Source of the factor: Knuth, "The Art of Computer Programming", MMIX's generator.
+        let mut state = 3_u64;
         let mut random = || {
-            state = crate::exact::hash::mix(state + 1, 0x1234_5678_9abc_def1);
+            state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1);
             (state >> 11) as f64 / 2.0_f64.powi(53) - 0.5
         };
         let (mut flat, mut solid) = (0, 0);

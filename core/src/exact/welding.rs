@@ -2,28 +2,28 @@
 
 use hashbrown::{HashTable, hash_table::Entry};
 
-use super::hash::{mix, random_key};
+use super::hash::HashFunction;
 
 /// The bits of a point's coordinates. Points are in one place where all their bits are equal, so
 /// zeros of either sign are two places.
 pub(crate) type PointBits = [u64; 3];
 
 /// Hashes points. All copies of one hasher give the same point the same hash.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone)]
 pub(crate) struct PointHasher {
-    key: u64,
+    function: HashFunction,
 }
 
 impl PointHasher {
-    /// A hasher whose hashes nobody can foresee.
+    /// Chooses a hasher whose hashes nobody can foresee.
     pub(crate) fn new() -> Self {
-        Self { key: random_key() }
+        Self { function: HashFunction::random() }
     }
 
-    /// The hash of a point.
+    /// Hashes a point.
     #[inline(always)]
-    pub(crate) fn hash(self, point: PointBits) -> u64 {
-        point.into_iter().fold(self.key, mix)
+    pub(crate) fn hash(&self, point: PointBits) -> u64 {
+        self.function.hash(point)
     }
 }
 
@@ -36,12 +36,12 @@ pub(crate) struct PointTable {
 }
 
 impl PointTable {
-    /// An empty table that may grow to so many places without moving.
+    /// Makes an empty table that may grow to so many places without moving.
     pub(crate) fn new(hasher: PointHasher, capacity: usize) -> Self {
         Self { firsts: HashTable::with_capacity(capacity), hasher }
     }
 
-    /// The entry of a point's place: occupied by the index of the first point there, or vacant.
+    /// Finds the entry of a point's place: occupied by the index of the first point there, or vacant.
     /// `point_at` gives the points whose indices the table holds.
     #[inline(always)]
     pub(crate) fn entry(
@@ -52,7 +52,7 @@ impl PointTable {
         self.entry_with_hash(self.hasher.hash(point), point, point_at)
     }
 
-    /// The same for a point whose hash by the table's hasher is known.
+    /// Does the same for a point whose hash by the table's hasher is known.
     #[inline(always)]
     pub(crate) fn entry_with_hash(
         &mut self,
@@ -60,11 +60,7 @@ impl PointTable {
         point: PointBits,
         point_at: impl Fn(u32) -> PointBits,
     ) -> Entry<'_, u32> {
-        let hasher = self.hasher;
-        self.firsts.entry(
-            hash,
-            |&index| point_at(index) == point,
-            |&index| hasher.hash(point_at(index)),
-        )
+        let Self { firsts, hasher } = self;
+        firsts.entry(hash, |&index| point_at(index) == point, |&index| hasher.hash(point_at(index)))
     }
 }

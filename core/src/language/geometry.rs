@@ -1,22 +1,38 @@
-//! The shapes of a scene text.
+//! The section of the shapes.
 
 use std::sync::Arc;
 
 use glam::{DVec2, DVec3};
 
 use super::{
-    block::{Block, Field},
-    diagnostic::shown,
-    lexer::Word,
-    reader::{Reader, plain},
+    block::Block, diagnostic::quoted, direction::direction, field::Field, lexer::Word,
+    pieces::Runs, symbol::Symbols, triangles::Triangles, walk::Walk,
 };
 use crate::{
     exact::predicates::{self, QuadrangleFault},
     scene::{
-        Mesh, MeshShape, MeshVertices, Operation, Parallelepiped, Quadrangle, Solid, SolidNode,
-        Sphere, Triangle,
+        Mesh, MeshShape, MeshVertices, Operation, Parallelepiped, Quadrangle, Scene, Solid,
+        SolidNode, Sphere, Triangle,
     },
 };
+
+/// The shapes that are known.
+#[derive(Debug)]
+pub(super) struct Shapes<'t> {
+    runs: Runs,
+    triangles: Triangles,
+    spheres: Vec<Sphere>,
+    quadrangles: Vec<Quadrangle>,
+    quadrangle_texcoords: Vec<(u32, [DVec2; 4])>,
+    parallelepipeds: Vec<Parallelepiped>,
+    solids: Vec<Solid>,
+    /// The meshes; their files have not been read yet.
+    meshes: Vec<Mesh>,
+    /// The name of each mesh's file.
+    mesh_files: Vec<Word<'t>>,
+    /// The next primitive's number.
+    primitive: u64,
+}
 
 /// A set operation whose end has not come yet.
 struct OpenOperation<'t> {
@@ -25,32 +41,54 @@ struct OpenOperation<'t> {
     operands: u32,
 }
 
-impl<'t> Reader<'t> {
-    /// Reads the shapes. Operations may be nested a million deep: those that are open form a
-    /// list, not calls.
-    pub(crate) fn read_geometry(&mut self, opening: Word<'t>) {
-        self.blocks.enter(Block::Geometry, opening);
+impl<'t> Shapes<'t> {
+    /// Starts without shapes. Runs of triangles are parsed in parallel by pieces of about so many
+    /// bytes.
+    pub(super) fn new(piece: usize) -> Self {
+        Self {
+            runs: Runs::new(piece),
+            triangles: Triangles::new(),
+            spheres: Vec::new(),
+            quadrangles: Vec::new(),
+            quadrangle_texcoords: Vec::new(),
+            parallelepipeds: Vec::new(),
+            solids: Vec::new(),
+            meshes: Vec::new(),
+            mesh_files: Vec::new(),
+            primitive: 0,
+        }
+    }
+
+    /// Reads a `geometry` block. Operations may be nested a million deep: those that are open form
+    /// a list, not calls.
+    pub(super) fn read_geometry(
+        &mut self,
+        walk: &mut Walk<'t>,
+        symbols: &mut Symbols<'t>,
+        opening: Word<'t>,
+    ) {
+        walk.enter(Block::Geometry, opening);
         let mut operations: Vec<OpenOperation<'t>> = Vec::new();
         let mut nodes: Vec<SolidNode> = Vec::new();
         let mut leaf_count = 0;
         loop {
-            let Some(word) = self.blocks.next() else {
+            let Some(word) = walk.next() else {
                 let Some(done) = operations.pop() else { return };
-                self.finish_operation(&done, &mut nodes);
+                finish_operation(walk, &done, &mut nodes);
                 if let Some(outer) = operations.last_mut() {
                     outer.operands += 1;
                 } else {
-                    self.finish_solid(done.opening, std::mem::take(&mut nodes));
+                    self.finish_solid(walk, done.opening, std::mem::take(&mut nodes));
                     leaf_count = 0;
                 }
                 continue;
             };
             let Some(block) = Block::opened_by(&word) else {
-                self.blocks.skip_unknown_keyword(word);
+                walk.skip_unknown_keyword(word);
                 continue;
             };
             if let Some(operation) = operation(block) {
-                self.blocks.enter(block, word);
+                walk.enter(block, word);
                 operations.push(OpenOperation { opening: word, operation, operands: 0 });
                 continue;
             }
@@ -61,11 +99,11 @@ impl<'t> Reader<'t> {
                     leaf_count += 1;
                 } else {
                     let outer = outer.opening;
-                    self.report().error(word.span(), || {
+                    walk.report.error(word.span(), || {
                         format!(
-                            "{} takes solids: spheres, parallelepipeds and operations on them, no {}",
-                            shown(outer.bytes),
-                            plain(word)
+                            "{} is not a solid; {} takes spheres, parallelepipeds and operations on them",
+                            quoted(word.bytes),
+                            quoted(outer.bytes)
                         )
                     });
                 }
@@ -74,10 +112,10 @@ impl<'t> Reader<'t> {
             match block {
                 Block::Sphere => {
                     let primitive =
-                        if is_alone { self.next_primitive(word) } else { leaf_count - 1 };
-                    if let Some(sphere) = self.read_sphere(word, primitive) {
+                        if is_alone { self.next_primitive(walk, word) } else { leaf_count - 1 };
+                    if let Some(sphere) = read_sphere(walk, symbols, word, primitive) {
                         if is_alone {
-                            self.scene.spheres.push(sphere);
+                            self.spheres.push(sphere);
                         } else {
                             nodes.push(SolidNode::Sphere(sphere));
                         }
@@ -85,51 +123,39 @@ impl<'t> Reader<'t> {
                 }
                 Block::Parallelepiped => {
                     let primitive =
-                        if is_alone { self.next_primitive(word) } else { leaf_count - 1 };
-                    if let Some(parallelepiped) = self.read_parallelepiped(word, primitive) {
+                        if is_alone { self.next_primitive(walk, word) } else { leaf_count - 1 };
+                    if let Some(parallelepiped) =
+                        read_parallelepiped(walk, symbols, word, primitive)
+                    {
                         if is_alone {
-                            self.scene.parallelepipeds.push(parallelepiped);
+                            self.parallelepipeds.push(parallelepiped);
                         } else {
                             nodes.push(SolidNode::Parallelepiped(parallelepiped));
                         }
                     }
                 }
                 Block::Triangle => {
-                    if is_alone && self.read_plain_triangles(word) {
+                    if is_alone && self.read_plain_triangles(walk, symbols, word) {
                         continue;
                     }
-                    self.read_triangle(word);
+                    self.read_triangle(walk, symbols, word);
                 }
-                Block::Quadrangle => self.read_quadrangle(word),
-                _ => self.read_mesh(word, block),
+                Block::Quadrangle => self.read_quadrangle(walk, symbols, word),
+                _ => self.read_mesh(walk, symbols, word, block),
             }
         }
     }
 
-    fn finish_operation(&mut self, done: &OpenOperation<'t>, nodes: &mut Vec<SolidNode>) {
-        let OpenOperation { opening, operation, operands } = *done;
-        if operands < 2 && !self.blocks.is_cut {
-            let found = if operands == 0 { "none" } else { "only one" };
-            self.report().error(opening.span(), || {
-                format!(
-                    "{} joins two or more solids, but {found} stands here",
-                    shown(opening.bytes)
-                )
-            });
-        }
-        nodes.push(SolidNode::Operation { operation, operands });
+    fn finish_solid(&mut self, walk: &mut Walk<'t>, opening: Word<'t>, nodes: Vec<SolidNode>) {
+        let primitive = self.next_primitive(walk, opening);
+        self.solids.push(Solid { nodes, primitive });
     }
 
-    fn finish_solid(&mut self, opening: Word<'t>, nodes: Vec<SolidNode>) {
-        let primitive = self.next_primitive(opening);
-        self.scene.solids.push(Solid { nodes, primitive });
-    }
-
-    /// The number of a primitive that begins at `word`.
-    fn next_primitive(&mut self, word: Word<'t>) -> u32 {
+    /// Counts a primitive that begins at `word`, and gives its number.
+    fn next_primitive(&mut self, walk: &mut Walk<'t>, word: Word<'t>) -> u32 {
         let number = u32::try_from(self.primitive);
         if self.primitive == u64::from(u32::MAX) {
-            self.report()
+            walk.report
                 .error(word.span(), || format!("a scene has at most {} primitives", u32::MAX));
         }
         self.primitive += 1;
@@ -138,265 +164,130 @@ impl<'t> Reader<'t> {
 
     /// Reads as many plain triangle blocks as there are, from the one that `word` opens; whether
     /// there was one.
-    fn read_plain_triangles(&mut self, word: Word<'t>) -> bool {
-        let at = self.triangles.read_run(
-            self.text,
+    fn read_plain_triangles(
+        &mut self,
+        walk: &mut Walk<'t>,
+        symbols: &mut Symbols<'t>,
+        word: Word<'t>,
+    ) -> bool {
+        let at = self.runs.read(
+            walk.lexer.text(),
             word.start,
-            self.piece,
+            &mut self.triangles,
             &mut self.primitive,
-            &mut self.symbols,
+            symbols,
         );
         if at > word.start {
-            self.blocks.lexer.go_to(at);
+            walk.lexer.go_to(at);
         }
         at > word.start
     }
 
-    fn material(&mut self, word: Word<'t>, shape: &'static str) -> Option<u32> {
-        let name = self.blocks.value_word(word, "the name of a material")?;
-        Some(match shape {
-            "triangle" | "quadrangle" => self.symbols.use_on_flat(name, 1),
-            _ => self.symbols.use_on_untexturable(name, shape),
-        })
-    }
-
-    fn read_sphere(&mut self, opening: Word<'t>, primitive: u32) -> Option<Sphere> {
-        self.blocks.enter(Block::Sphere, opening);
-        let (mut coords, mut radius, mut material) =
-            (Field::default(), Field::default(), Field::default());
-        while let Some(word) = self.blocks.next() {
-            match word.bytes {
-                b"coords" | b"position" => self.read_coords(word, &mut coords),
-                b"radius" => {
-                    let value =
-                        self.blocks.number(word).and_then(|value| self.above_zero(word, value));
-                    radius.set(&mut self.blocks.report, word, value);
-                }
-                b"material" => {
-                    let value = self.material(word, "sphere");
-                    material.set(&mut self.blocks.report, word, value);
-                }
-                _ => self.blocks.skip_unknown_keyword(word),
-            }
-        }
-        let center = coords.require(&mut self.blocks, opening, "coords");
-        let radius = radius.require(&mut self.blocks, opening, "radius");
-        let material = material.require(&mut self.blocks, opening, "material");
-        Some(Sphere { center: center?, radius: radius?, material: material?, primitive })
-    }
-
-    fn read_triangle(&mut self, opening: Word<'t>) {
-        let primitive = self.next_primitive(opening);
+    fn read_triangle(&mut self, walk: &mut Walk<'t>, symbols: &mut Symbols<'t>, opening: Word<'t>) {
+        let primitive = self.next_primitive(walk, opening);
         let Some((vertices, texcoords, material)) =
-            self.read_corners(Block::Triangle, opening, "triangle")
+            read_corners(walk, symbols, Block::Triangle, opening, "triangle")
         else {
             return;
         };
-        self.triangles.add(
-            Triangle { vertices, material, primitive },
-            texcoords,
-            &mut self.symbols,
-        );
+        self.triangles.add(Triangle { vertices, material, primitive }, texcoords, symbols);
     }
 
-    fn read_quadrangle(&mut self, opening: Word<'t>) {
-        let primitive = self.next_primitive(opening);
+    fn read_quadrangle(
+        &mut self,
+        walk: &mut Walk<'t>,
+        symbols: &mut Symbols<'t>,
+        opening: Word<'t>,
+    ) {
+        let primitive = self.next_primitive(walk, opening);
         let Some((vertices, texcoords, material)) =
-            self.read_corners(Block::Quadrangle, opening, "quadrangle")
+            read_corners(walk, symbols, Block::Quadrangle, opening, "quadrangle")
         else {
             return;
         };
         match predicates::check_quadrangle(vertices) {
             Ok(None) => {}
-            Ok(Some(deviation)) => self.report().warn(opening.span(), || {
-                format!("this quadrangle is planar only to within {deviation:.3e}; taken as planar")
+            Ok(Some(deviation)) => walk.report.warn(opening.span(), || {
+                format!("this quadrangle is planar only to within {deviation:.3e}, but is taken as planar")
             }),
             Err(fault) => {
-                self.report().error(opening.span(), || match fault {
+                walk.report.error(opening.span(), || match fault {
                     QuadrangleFault::Degenerate => {
-                        "this quadrangle has no area: its vertices are on one line".into()
+                        "this quadrangle has no area: its vertices lie on one line".into()
                     }
                     QuadrangleFault::SamePlace => {
-                        "this quadrangle has two vertices in one place; three make a triangle".into()
+                        "two vertices of this quadrangle are equal; write a shape of three vertices as a `triangle`".into()
                     }
                     QuadrangleFault::Crossing => {
-                        "the sides of this quadrangle cross or touch; its vertices must stand in their order around it".into()
+                        "the sides of this quadrangle cross or touch; its vertices must go around it in order".into()
                     }
                     QuadrangleFault::NotPlanar { deviation, tolerance } => format!(
-                        "this quadrangle is not planar: its vertices are {deviation:.3e} off their plane, and \
-                         {tolerance:.3e} is the most; two triangles could be bent so"
+                        "this quadrangle is not planar: its vertices are {deviation:.3e} away from their plane, and at \
+                         most {tolerance:.3e} is allowed; use two triangles instead"
                     ),
                 });
                 return;
             }
         }
-        let index = self.scene.quadrangles.len() as u32;
-        self.scene.quadrangles.push(Quadrangle { vertices, material, primitive });
-        self.scene.quadrangle_texcoords.extend(texcoords.map(|texcoords| (index, texcoords)));
+        let index = self.quadrangles.len() as u32;
+        self.quadrangles.push(Quadrangle { vertices, material, primitive });
+        self.quadrangle_texcoords.extend(texcoords.map(|texcoords| (index, texcoords)));
     }
 
-    fn read_parallelepiped(&mut self, opening: Word<'t>, primitive: u32) -> Option<Parallelepiped> {
-        let (vertices, _, material) =
-            self.read_corners::<4>(Block::Parallelepiped, opening, "parallelepiped")?;
-        let corner = vertices[0];
-        let edges = [1, 2, 3].map(|k| vertices[k] - corner);
-        if predicates::is_coplanar(vertices[0], vertices[1], vertices[2], vertices[3]) {
-            self.report().error(opening.span(), || {
-                "this parallelepiped has no volume: its vertices are a corner and that corner's three \
-                 neighbours, not all in one plane"
-                    .into()
-            });
-            return None;
-        }
-        if !edges.iter().all(|edge| edge.is_finite()) {
-            self.report().error(opening.span(), || {
-                "this parallelepiped is too large to be computed with".into()
-            });
-            return None;
-        }
-        let condition = condition(edges);
-        if condition.is_nan() || condition > MOST_SHEARED {
-            self.report().error(opening.span(), || {
-                format!(
-                    "this parallelepiped is too flat to be computed with: its condition number is {condition:.1e}, \
-                     and {MOST_SHEARED:.0e} is the most"
-                )
-            });
-            return None;
-        }
-        Some(Parallelepiped { corner, edges, material, primitive })
-    }
-
-    /// Reads a block of `N` vertices, each perhaps with texture coordinates, and a material.
-    fn read_corners<const N: usize>(
+    fn read_mesh(
         &mut self,
-        block: Block,
+        walk: &mut Walk<'t>,
+        symbols: &mut Symbols<'t>,
         opening: Word<'t>,
-        shape: &'static str,
-    ) -> Option<([DVec3; N], Option<[DVec2; N]>, u32)> {
-        self.blocks.enter(block, opening);
-        let mut vertices = [DVec3::ZERO; N];
-        let mut texcoords = [Field::<DVec2>::default(); N];
-        let (mut count, mut is_sound) = (0, true);
-        let mut material = Field::default();
-        while let Some(word) = self.blocks.next() {
-            match word.bytes {
-                b"vertex" => {
-                    let vertex = self.blocks.numbers(word).map(DVec3::from);
-                    match vertices.get_mut(count) {
-                        Some(place) => *place = vertex.unwrap_or_default(),
-                        None if count == N => self.report().error(word.span(), || {
-                            format!("a {shape} has {N} vertices; this is one more")
-                        }),
-                        None => {}
-                    }
-                    is_sound &= vertex.is_some() && count < N;
-                    count += 1;
-                }
-                b"texcoord" | b"textureCoord" if N != 4 || block == Block::Quadrangle => {
-                    if word.bytes == b"textureCoord" {
-                        self.warn_synonym(word, "`texcoord`");
-                    }
-                    let value = self.blocks.numbers(word).map(DVec2::from);
-                    if word.bytes == b"textureCoord" && self.blocks.numbers_that_follow() > 0 {
-                        self.blocks.number(word); // The third of three coordinates.
-                    }
-                    is_sound &= value.is_some();
-                    match count.checked_sub(1) {
-                        Some(index) if index < N => {
-                            texcoords[index].set(&mut self.blocks.report, word, value);
-                        }
-                        Some(_) => {}
-                        None => {
-                            is_sound = false;
-                            self.report().error(word.span(), || {
-                                format!(
-                                    "{} stands behind the vertex that it belongs to",
-                                    shown(word.bytes)
-                                )
-                            });
-                        }
-                    }
-                }
-                b"material" => {
-                    let value = self.material(word, shape);
-                    material.set(&mut self.blocks.report, word, value);
-                }
-                _ => self.blocks.skip_unknown_keyword(word),
-            }
-        }
-        if count < N {
-            if !self.blocks.is_cut {
-                self.report().error(opening.span(), || {
-                    format!("a {shape} has {N} vertices, but this one has {count}")
-                });
-            }
-            is_sound = false;
-        }
-        let with_texcoords = texcoords.iter().filter(|texcoord| texcoord.word.is_some()).count();
-        if count >= N && with_texcoords > 0 && with_texcoords < N {
-            is_sound = false;
-            self.report().error(opening.span(), || {
-                format!(
-                    "every vertex has a `texcoord` or none has; here {with_texcoords} of {N} have"
-                )
-            });
-        }
-        let material = material.require(&mut self.blocks, opening, "material")?;
-        let texcoords = (with_texcoords == N)
-            .then(|| texcoords.map(|texcoord| texcoord.value.unwrap_or_default()));
-        is_sound.then_some((vertices, texcoords, material))
-    }
-
-    fn read_mesh(&mut self, opening: Word<'t>, block: Block) {
+        block: Block,
+    ) {
         if block == Block::StlModel {
-            self.warn_synonym(opening, "`mesh`");
+            walk.warn_synonym(opening, "`mesh`");
         }
-        let primitive = self.next_primitive(opening);
-        self.blocks.enter(block, opening);
+        let primitive = self.next_primitive(walk, opening);
+        walk.enter(block, opening);
         let (mut file, mut material) = (Field::default(), Field::default());
         let (mut scale, mut rotate, mut offset) =
             (Field::default(), Field::default(), Field::default());
-        while let Some(word) = self.blocks.next() {
+        while let Some(word) = walk.next() {
             match word.bytes {
                 b"file" | b"filename" => {
                     if word.bytes == b"filename" {
-                        self.warn_synonym(word, "`file`");
+                        walk.warn_synonym(word, "`file`");
                     }
-                    let value = self.file_name(word);
-                    file.set(&mut self.blocks.report, word, value);
+                    let value = walk.file_name(word);
+                    file.set(&mut walk.report, word, value);
                 }
                 b"material" => {
-                    let value = self.material(word, "mesh");
-                    material.set(&mut self.blocks.report, word, value);
+                    let value = material_name(walk, symbols, word, "mesh");
+                    material.set(&mut walk.report, word, value);
                 }
                 b"scale" => {
-                    let value =
-                        self.blocks.number(word).and_then(|value| self.above_zero(word, value));
-                    scale.set(&mut self.blocks.report, word, value);
+                    let value = walk.number_above_zero(word);
+                    scale.set(&mut walk.report, word, value);
                 }
                 b"rotate" => {
-                    let value = self.blocks.numbers(word).and_then(|[x, y, z, degrees]| {
+                    let value = walk.numbers(word).and_then(|[x, y, z, degrees]| {
                         let axis = DVec3::new(x, y, z);
                         if axis == DVec3::ZERO {
-                            self.refuse_value(|| "the axis of `rotate` must not be 0 0 0".into());
+                            walk.refuse_value(|| "the axis of `rotate` must not be 0 0 0".into());
                         }
                         (axis != DVec3::ZERO).then_some((axis, degrees))
                     });
-                    rotate.set(&mut self.blocks.report, word, value);
+                    rotate.set(&mut walk.report, word, value);
                 }
                 b"move" => {
-                    let value = self.blocks.numbers(word).map(DVec3::from);
-                    offset.set(&mut self.blocks.report, word, value);
+                    let value = walk.position(word);
+                    offset.set(&mut walk.report, word, value);
                 }
-                _ => self.blocks.skip_unknown_keyword(word),
+                _ => walk.skip_unknown_keyword(word),
             }
         }
-        let file = file.require(&mut self.blocks, opening, "file");
-        let material = material.require(&mut self.blocks, opening, "material");
+        let file = file.require(walk, opening, "file");
+        let material = material.require(walk, opening, "material");
         if let (Some(file), Some(material)) = (file, material) {
             self.mesh_files.push(file);
-            self.scene.meshes.push(Mesh {
+            self.meshes.push(Mesh {
                 path: String::from_utf8_lossy(file.bytes).into_owned(),
                 shape: Arc::new(MeshShape {
                     vertices: MeshVertices::Single(Vec::new()),
@@ -410,9 +301,208 @@ impl<'t> Reader<'t> {
             });
         }
     }
+
+    /// Gives what was read to the scene, symbols turned into indices of materials. The answer is
+    /// the name of each mesh's file.
+    pub(super) fn finish(mut self, symbols: &Symbols<'_>, scene: &mut Scene) -> Vec<Word<'t>> {
+        let index = |symbol: u32| symbols.get(symbol).definition.map_or(0, |(index, _)| index);
+        self.triangles.list.iter_mut().for_each(|shape| shape.material = index(shape.material));
+        self.spheres.iter_mut().for_each(|shape| shape.material = index(shape.material));
+        self.quadrangles.iter_mut().for_each(|shape| shape.material = index(shape.material));
+        self.parallelepipeds.iter_mut().for_each(|shape| shape.material = index(shape.material));
+        self.meshes.iter_mut().for_each(|shape| shape.material = index(shape.material));
+        for node in self.solids.iter_mut().flat_map(|solid| &mut solid.nodes) {
+            match node {
+                SolidNode::Sphere(shape) => shape.material = index(shape.material),
+                SolidNode::Parallelepiped(shape) => shape.material = index(shape.material),
+                SolidNode::Operation { .. } => {}
+            }
+        }
+        scene.spheres = self.spheres;
+        scene.triangles = self.triangles.list;
+        scene.triangle_texcoords = self.triangles.texcoords;
+        scene.dropped = self.triangles.dropped;
+        scene.quadrangles = self.quadrangles;
+        scene.quadrangle_texcoords = self.quadrangle_texcoords;
+        scene.parallelepipeds = self.parallelepipeds;
+        scene.solids = self.solids;
+        scene.meshes = self.meshes;
+        self.mesh_files
+    }
 }
 
-/// The largest condition number of a parallelepiped: beyond, less than four digits of a hit
+fn finish_operation(walk: &mut Walk<'_>, done: &OpenOperation<'_>, nodes: &mut Vec<SolidNode>) {
+    let OpenOperation { opening, operation, operands } = *done;
+    if operands < 2 && !walk.is_cut {
+        let found = if operands == 0 { "none is given" } else { "only one is given" };
+        walk.report.error(opening.span(), || {
+            format!("{} joins two or more solids, but {found}", quoted(opening.bytes))
+        });
+    }
+    nodes.push(SolidNode::Operation { operation, operands });
+}
+
+/// Reads the name of a material, for a `shape`.
+fn material_name<'t>(
+    walk: &mut Walk<'t>,
+    symbols: &mut Symbols<'t>,
+    word: Word<'t>,
+    shape: &'static str,
+) -> Option<u32> {
+    let name = walk.value_word(word, "the name of a material")?;
+    Some(match shape {
+        "triangle" | "quadrangle" => symbols.use_on_flat(name, 1),
+        _ => symbols.use_on_untexturable(name, shape),
+    })
+}
+
+fn read_sphere<'t>(
+    walk: &mut Walk<'t>,
+    symbols: &mut Symbols<'t>,
+    opening: Word<'t>,
+    primitive: u32,
+) -> Option<Sphere> {
+    walk.enter(Block::Sphere, opening);
+    let (mut coords, mut radius, mut material) =
+        (Field::default(), Field::default(), Field::default());
+    while let Some(word) = walk.next() {
+        match word.bytes {
+            b"coords" | b"position" => walk.read_coords(word, &mut coords),
+            b"radius" => {
+                let value = walk.number_above_zero(word);
+                radius.set(&mut walk.report, word, value);
+            }
+            b"material" => {
+                let value = material_name(walk, symbols, word, "sphere");
+                material.set(&mut walk.report, word, value);
+            }
+            _ => walk.skip_unknown_keyword(word),
+        }
+    }
+    let center = coords.require(walk, opening, "coords");
+    let radius = radius.require(walk, opening, "radius");
+    let material = material.require(walk, opening, "material");
+    Some(Sphere { center: center?, radius: radius?, material: material?, primitive })
+}
+
+fn read_parallelepiped<'t>(
+    walk: &mut Walk<'t>,
+    symbols: &mut Symbols<'t>,
+    opening: Word<'t>,
+    primitive: u32,
+) -> Option<Parallelepiped> {
+    let (vertices, _, material) =
+        read_corners::<4>(walk, symbols, Block::Parallelepiped, opening, "parallelepiped")?;
+    let corner = vertices[0];
+    let edges = [1, 2, 3].map(|k| vertices[k] - corner);
+    if predicates::is_coplanar(vertices[0], vertices[1], vertices[2], vertices[3]) {
+        walk.report.error(opening.span(), || {
+            "this parallelepiped has no volume; its vertices must be a corner and that corner's three \
+                 neighbours, not all in one plane"
+                .into()
+        });
+        return None;
+    }
+    if !edges.iter().all(|edge| edge.is_finite()) {
+        walk.report.error(opening.span(), || {
+            "this parallelepiped is too large; the longest edge is about 1.8e308".into()
+        });
+        return None;
+    }
+    let condition = condition(edges);
+    if condition.is_nan() || condition > MOST_SHEARED {
+        walk.report.error(opening.span(), || {
+            format!(
+                "this parallelepiped is too flat: its condition number is {condition:.1e}, \
+                     and at most {MOST_SHEARED:.0e} is allowed"
+            )
+        });
+        return None;
+    }
+    Some(Parallelepiped { corner, edges, material, primitive })
+}
+
+/// Reads a block of `N` vertices, each perhaps with texture coordinates, and a material.
+fn read_corners<'t, const N: usize>(
+    walk: &mut Walk<'t>,
+    symbols: &mut Symbols<'t>,
+    block: Block,
+    opening: Word<'t>,
+    shape: &'static str,
+) -> Option<([DVec3; N], Option<[DVec2; N]>, u32)> {
+    walk.enter(block, opening);
+    let mut vertices = [DVec3::ZERO; N];
+    let mut texcoords = [Field::<DVec2>::default(); N];
+    let (mut count, mut is_sound) = (0, true);
+    let mut material = Field::default();
+    while let Some(word) = walk.next() {
+        match word.bytes {
+            b"vertex" => {
+                let vertex = walk.position(word);
+                match vertices.get_mut(count) {
+                    Some(place) => *place = vertex.unwrap_or_default(),
+                    None if count == N => walk.report.error(word.span(), || {
+                        format!("a {shape} has {N} vertices, but this is one more")
+                    }),
+                    None => {}
+                }
+                is_sound &= vertex.is_some() && count < N;
+                count += 1;
+            }
+            b"texcoord" | b"textureCoord" if N != 4 || block == Block::Quadrangle => {
+                if word.bytes == b"textureCoord" {
+                    walk.warn_synonym(word, "`texcoord`");
+                }
+                let value = walk.numbers(word).map(DVec2::from);
+                if word.bytes == b"textureCoord" && walk.numbers_that_follow() > 0 {
+                    walk.number(word); // The third of three coordinates.
+                }
+                is_sound &= value.is_some();
+                match count.checked_sub(1) {
+                    Some(index) if index < N => {
+                        texcoords[index].set(&mut walk.report, word, value);
+                    }
+                    Some(_) => {}
+                    None => {
+                        is_sound = false;
+                        walk.report.error(word.span(), || {
+                            format!(
+                                "{} must come after the vertex that it belongs to",
+                                quoted(word.bytes)
+                            )
+                        });
+                    }
+                }
+            }
+            b"material" => {
+                let value = material_name(walk, symbols, word, shape);
+                material.set(&mut walk.report, word, value);
+            }
+            _ => walk.skip_unknown_keyword(word),
+        }
+    }
+    if count < N {
+        if !walk.is_cut {
+            walk.report.error(opening.span(), || {
+                format!("a {shape} has {N} vertices, but this one has {count}")
+            });
+        }
+        is_sound = false;
+    }
+    let with_texcoords = texcoords.iter().filter(|texcoord| texcoord.word.is_some()).count();
+    if count >= N && with_texcoords > 0 && with_texcoords < N {
+        is_sound = false;
+        walk.report.error(opening.span(), || {
+            format!("a `texcoord` is given for {with_texcoords} of {N} vertices; give one for all of them or for none")
+        });
+    }
+    let material = material.require(walk, opening, "material")?;
+    let texcoords =
+        (with_texcoords == N).then(|| texcoords.map(|texcoord| texcoord.value.unwrap_or_default()));
+    is_sound.then_some((vertices, texcoords, material))
+}
+
+/// The largest condition number of a parallelepiped. Beyond it, fewer than four digits of a hit
 /// would be right.
 const MOST_SHEARED: f64 = 1e12;
 
@@ -425,14 +515,8 @@ fn operation(block: Block) -> Option<Operation> {
     }
 }
 
-/// A vector of length 1 along `vector`, however long that is.
-pub(crate) fn direction(vector: DVec3) -> DVec3 {
-    let scaled = vector / vector.abs().max_element();
-    scaled / scaled.length()
-}
-
-/// The condition number (Frobenius) of three edges, each taken as long as the others: how much
-/// more the inverse of a sheared box errs than that of an upright one.
+/// Computes the condition number (Frobenius) of three edges, each taken as long as the others: how
+/// much more the inverse of a sheared box errs than that of an upright one.
 fn condition(edges: [DVec3; 3]) -> f64 {
     let [a, b, c] = edges.map(direction);
     let faces = [b.cross(c), c.cross(a), a.cross(b)];

@@ -10,27 +10,27 @@ use crate::text::{
 
 /// Walks over the words of a scene text.
 #[derive(Debug, Clone)]
-pub(crate) struct Lexer<'t> {
+pub(super) struct Lexer<'t> {
     text: &'t [u8],
     at: usize,
 }
 
-/// A word of the text and where it stands.
+/// A word of the text and its place.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) struct Word<'t> {
+pub(super) struct Word<'t> {
     /// The word, without its quotes.
-    pub(crate) bytes: &'t [u8],
+    pub(super) bytes: &'t [u8],
     /// Byte offset of its beginning, the opening quote included.
-    pub(crate) start: usize,
-    /// Byte offset behind it, the closing quote included.
-    pub(crate) end: usize,
-    /// How it is written.
-    pub(crate) quotes: Quotes,
+    pub(super) start: usize,
+    /// Byte offset of its end, the closing quote included.
+    pub(super) end: usize,
+    /// The quotes around it.
+    pub(super) quotes: Quotes,
 }
 
 /// The quotes around a word.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Quotes {
+pub(super) enum Quotes {
     /// None.
     Bare,
     /// One on either side.
@@ -40,13 +40,18 @@ pub(crate) enum Quotes {
 }
 
 impl Word<'_> {
-    /// Where the word stands, in bytes.
-    pub(crate) fn span(&self) -> Range<usize> {
+    /// Gives the bytes of the text that the word takes.
+    pub(super) fn span(&self) -> Range<usize> {
         self.start..self.end
     }
 
+    /// Gives the word as text, for messages and paths.
+    pub(super) fn to_text(self) -> String {
+        String::from_utf8_lossy(self.bytes).into_owned()
+    }
+
     /// Whether it can only be meant as a number: it begins with a digit, a sign or a point.
-    pub(crate) fn is_number_like(&self) -> bool {
+    pub(super) fn is_number_like(&self) -> bool {
         let digits = unsigned(self.bytes);
         let is_signed = digits.len() < self.bytes.len();
         self.quotes == Quotes::Bare
@@ -57,12 +62,12 @@ impl Word<'_> {
     }
 
     /// Whether it is `…` or `...`, which people leave where a list goes on.
-    pub(crate) fn is_ellipsis(&self) -> bool {
+    pub(super) fn is_ellipsis(&self) -> bool {
         self.quotes == Quotes::Bare && matches!(self.bytes, b"..." | b"\xe2\x80\xa6")
     }
 
-    /// The word as a finite or infinite number; `None` when it is none or NaN.
-    pub(crate) fn number(&self) -> Option<f64> {
+    /// Reads the word as a finite or infinite number; `None` when it is none or NaN.
+    pub(super) fn number(&self) -> Option<f64> {
         if self.quotes != Quotes::Bare || self.is_named_infinity_or_nan() {
             return None;
         }
@@ -70,12 +75,12 @@ impl Word<'_> {
     }
 
     /// Whether it spells NaN or infinity.
-    pub(crate) fn is_named_infinity_or_nan(&self) -> bool {
+    pub(super) fn is_named_infinity_or_nan(&self) -> bool {
         is_infinity_or_nan(unsigned(self.bytes))
     }
 }
 
-/// A number without its sign.
+/// Takes the sign off a number.
 fn unsigned(word: &[u8]) -> &[u8] {
     word.strip_prefix(b"-").or(word.strip_prefix(b"+")).unwrap_or(word)
 }
@@ -86,27 +91,27 @@ fn is_infinity_or_nan(unsigned: &[u8]) -> bool {
 
 impl<'t> Lexer<'t> {
     /// Starts at byte `at` of `text`.
-    pub(crate) fn new(text: &'t [u8], at: usize) -> Self {
+    pub(super) fn new(text: &'t [u8], at: usize) -> Self {
         Self { text, at }
     }
 
-    /// The whole text.
-    pub(crate) fn text(&self) -> &'t [u8] {
+    /// Gives the whole text.
+    pub(super) fn text(&self) -> &'t [u8] {
         self.text
     }
 
-    /// The byte that is looked at next.
-    pub(crate) fn at(&self) -> usize {
+    /// Gives the offset of the byte that is looked at next.
+    pub(super) fn at(&self) -> usize {
         self.at
     }
 
     /// Goes on from byte `at`.
-    pub(crate) fn go_to(&mut self, at: usize) {
+    pub(super) fn go_to(&mut self, at: usize) {
         self.at = at;
     }
 
     /// Reads one word.
-    pub(crate) fn next(&mut self) -> Option<Word<'t>> {
+    pub(super) fn next(&mut self) -> Option<Word<'t>> {
         self.skip_space();
         let start = self.at;
         let first = *self.text.get(start)?;
@@ -127,19 +132,19 @@ impl<'t> Lexer<'t> {
         Some(Word { bytes, start, end: self.at, quotes: Quotes::Bare })
     }
 
-    /// The word that [`Lexer::next`] would read.
-    pub(crate) fn peek(&self) -> Option<Word<'t>> {
+    /// Reads the word that [`Lexer::next`] would read, and stays before it.
+    pub(super) fn peek(&self) -> Option<Word<'t>> {
         self.clone().next()
     }
 
     /// Goes to the end of the line.
-    pub(crate) fn skip_line(&mut self) {
+    pub(super) fn skip_line(&mut self) {
         let rest = &self.text[self.at..];
         self.at += memchr::memchr(b'\n', rest).unwrap_or(rest.len());
     }
 
     /// Goes over white space and comments.
-    pub(crate) fn skip_space(&mut self) {
+    pub(super) fn skip_space(&mut self) {
         while let Some(&byte) = self.text.get(self.at) {
             match class(byte) {
                 Class::Space => self.at += 1,
@@ -167,7 +172,7 @@ impl<'t> Lexer<'t> {
     }
 }
 
-/// The length of the white space character beyond ASCII that `text` begins with, or 0. A byte
+/// Measures the white space character beyond ASCII that `text` begins with, 0 for none. A byte
 /// order mark counts, since files that begin with one get appended to others.
 fn wide_space_length(text: &[u8]) -> usize {
     match text {

@@ -1,65 +1,42 @@
-//! The triangles of a scene text. Large scenes are little else, so plain triangle blocks are
-//! parsed by a scanner of their own, pieces of the text in parallel. It gives up at whatever is
-//! not plain and leaves it to the reader of all blocks, so that there is one place that knows
-//! about mistakes, and any number of threads reads the same scene.
+//! The triangles of a scene text, each only once.
 
 use hashbrown::{HashTable, hash_table::Entry};
-use rayon::prelude::*;
 
 use glam::{DVec2, DVec3};
 
-use super::{
-    lexer::{Lexer, Quotes, Word},
-    symbol::Symbols,
-};
+use super::symbol::Symbols;
 use crate::{
-    exact::{
-        hash::{mix, random_key, spread},
-        predicates::is_collinear,
-    },
-    scene::{Dropped, Triangle},
-    text::{
-        bytes::{Class, class},
-        number::scan_number,
-    },
+    exact::{hash::HashFunction, predicates::is_collinear},
+    scene::{DroppedFaces, Triangle},
 };
-
-/// Bytes of text that are parsed at once: enough to keep a thread busy, few enough that what is
-/// parsed but not yet kept takes little memory.
-pub(crate) const PIECE: usize = 256 << 10;
 
 /// The triangles that a scene keeps: of an area above zero, each only once.
 #[derive(Debug)]
-pub(crate) struct Triangles {
-    /// Their `material` is a symbol.
-    pub(crate) list: Vec<Triangle>,
-    /// By ascending index in `list`.
-    pub(crate) texcoords: Vec<(u32, [DVec2; 3])>,
-    pub(crate) dropped: Dropped,
+pub(super) struct Triangles {
+    /// The triangles; their `material` is a symbol.
+    pub(super) list: Vec<Triangle>,
+    /// Explicit texture coordinates, by ascending index in `list`.
+    pub(super) texcoords: Vec<(u32, [DVec2; 3])>,
+    pub(super) dropped: DroppedFaces,
     /// Index in `list` and half a hash of each triangle.
     table: HashTable<(u32, u32)>,
-    /// Nobody can write a file whose hashes collide: the key differs from run to run. It has no
-    /// influence on what is kept.
-    key: u64,
-    /// Before this byte the text has to be read in order.
-    parallel_from: usize,
+    pub(super) hash_function: HashFunction,
 }
 
 impl Triangles {
-    /// None yet.
-    pub(crate) fn new() -> Self {
+    /// Starts without triangles.
+    pub(super) fn new() -> Self {
         Self {
             list: Vec::new(),
             texcoords: Vec::new(),
-            dropped: Dropped::default(),
+            dropped: DroppedFaces::default(),
             table: HashTable::new(),
-            key: random_key(),
-            parallel_from: 0,
+            hash_function: HashFunction::random(),
         }
     }
 
     /// Adds a triangle unless it has no area or is there already.
-    pub(crate) fn add(
+    pub(super) fn add(
         &mut self,
         triangle: Triangle,
         texcoords: Option<[DVec2; 3]>,
@@ -72,27 +49,26 @@ impl Triangles {
             self.add_solid(
                 triangle,
                 texcoords,
-                hash_vertices(&triangle.vertices, self.key),
+                hash_vertices(&triangle.vertices, &self.hash_function),
                 symbols,
             );
         }
     }
 
     /// Adds a triangle of an area above zero.
-    fn add_solid(
+    pub(super) fn add_solid(
         &mut self,
         triangle: Triangle,
         texcoords: Option<[DVec2; 3]>,
         vertex_hash: u64,
         symbols: &mut Symbols<'_>,
     ) {
-        let mut hash = mix(vertex_hash, u64::from(triangle.material));
+        let function = &self.hash_function;
+        let mut hash = function.extend(vertex_hash, [u64::from(triangle.material)]);
         if let Some(texcoords) = texcoords {
             let first = first_vertex(&triangle.vertices);
-            for k in 0..3 {
-                let texcoord = texcoords[(first + k) % 3];
-                hash = mix(mix(hash, texcoord.x.to_bits()), texcoord.y.to_bits());
-            }
+            let texcoord = |k: usize| texcoords[(first + k) % 3].to_array().map(f64::to_bits);
+            hash = function.extend(hash, (0..3).flat_map(texcoord));
         }
         let half = (hash >> 32) as u32;
         let (list, known_texcoords) = (&self.list, &self.texcoords);
@@ -115,264 +91,6 @@ impl Triangles {
                 self.texcoords.extend(texcoords.map(|texcoords| (index, texcoords)));
             }
         }
-    }
-
-    /// Reads plain triangle blocks from byte `at` of `text`, where one should begin, and gives
-    /// the place of the first word that it leaves to others. `primitive` is the number of the
-    /// next primitive.
-    pub(crate) fn read_run<'t>(
-        &mut self,
-        text: &'t [u8],
-        at: usize,
-        piece: usize,
-        primitive: &mut u64,
-        symbols: &mut Symbols<'t>,
-    ) -> usize {
-        if (Scanner { text, at }).triangle().is_none() {
-            return at;
-        }
-        let key = self.key;
-        let threads = rayon::current_num_threads();
-        if at < self.parallel_from || threads == 1 {
-            let piece = Piece::parse(text, at, at.saturating_add(piece), key);
-            return self.adopt(&[piece], primitive, symbols);
-        }
-        let count = PIECES_A_THREAD * threads;
-        let mut window = Window::parse(text, at, piece, count, key);
-        loop {
-            let (adopted, next) = rayon::join(
-                || self.adopt(&window.pieces, primitive, symbols),
-                || window.is_whole.then(|| Window::parse(text, window.end, piece, count, key)),
-            );
-            if adopted < window.end {
-                // Up to two windows were parsed in vain: read twice as far before trying again.
-                self.parallel_from = adopted.saturating_add(4 * count * piece);
-            }
-            match next {
-                Some(next) if window.end == adopted => window = next,
-                _ => return adopted,
-            }
-        }
-    }
-
-    /// Takes over what was parsed as far as it is what reading on from the first piece would
-    /// have given; the answer is where that ends.
-    fn adopt<'t>(
-        &mut self,
-        pieces: &[Piece<'t>],
-        primitive: &mut u64,
-        symbols: &mut Symbols<'t>,
-    ) -> usize {
-        let mut at = pieces[0].start;
-        for piece in pieces {
-            if piece.start != at || *primitive + u64::from(piece.count) > u64::from(u32::MAX) {
-                break;
-            }
-            let names: Vec<u32> = piece
-                .names
-                .iter()
-                .map(|&(word, count)| symbols.use_on_flat(word, u64::from(count)))
-                .collect();
-            for (triangle, &hash) in piece.triangles.iter().zip(&piece.hashes) {
-                let triangle = Triangle {
-                    material: names[triangle.material as usize],
-                    primitive: triangle.primitive + *primitive as u32,
-                    ..*triangle
-                };
-                self.add_solid(triangle, None, hash, symbols);
-            }
-            self.dropped.zero_area += u64::from(piece.count) - piece.triangles.len() as u64;
-            *primitive += u64::from(piece.count);
-            at = piece.stop;
-        }
-        at
-    }
-}
-
-/// Pieces that a thread has to parse before their triangles are taken over.
-const PIECES_A_THREAD: usize = 2;
-
-/// Neighbouring pieces of text.
-struct Window<'t> {
-    /// At least one.
-    pieces: Vec<Piece<'t>>,
-    /// Where the last piece ends if all is plain up to there.
-    end: usize,
-    /// Whether another window may begin at the end.
-    is_whole: bool,
-}
-
-impl<'t> Window<'t> {
-    /// Parses up to `count` pieces from byte `at`.
-    fn parse(text: &'t [u8], at: usize, piece: usize, count: usize, key: u64) -> Self {
-        let mut bounds = vec![at];
-        let mut end = at;
-        while bounds.len() <= count
-            && let Some(start) = find_triangle_line(text, end.saturating_add(piece), piece)
-        {
-            bounds.push(start);
-            end = start;
-        }
-        let is_whole = bounds.len() > count;
-        if !is_whole {
-            end = end.saturating_add(piece).min(text.len());
-            bounds.push(end);
-        }
-        let pieces = bounds
-            .par_windows(2)
-            .map(|bounds| Piece::parse(text, bounds[0], bounds[1], key))
-            .collect();
-        Self { pieces, end, is_whole }
-    }
-}
-
-/// The first `triangle` from byte `from` on that begins a line, within `reach` bytes.
-fn find_triangle_line(text: &[u8], from: usize, reach: usize) -> Option<usize> {
-    let end = from.saturating_add(reach).min(text.len());
-    memchr::memchr_iter(b'\n', text.get(from..end)?)
-        .map(|line_end| {
-            let mut scanner = Scanner { text, at: from + line_end + 1 };
-            while matches!(text.get(scanner.at), Some(b' ' | b'\t')) {
-                scanner.at += 1;
-            }
-            scanner.at
-        })
-        .find(|&start| Scanner { text, at: start }.skip_word(b"triangle").is_some())
-}
-
-/// What a piece of the text holds up to the first thing that is not a plain triangle block.
-struct Piece<'t> {
-    start: usize,
-    /// Where the next word stands.
-    stop: usize,
-    /// Blocks that were read.
-    count: u32,
-    /// Those of an area above zero. `material` counts in `names`, `primitive` in the piece.
-    triangles: Vec<Triangle>,
-    /// Of their vertices.
-    hashes: Vec<u64>,
-    /// First uses of materials, and how many follow.
-    names: Vec<(Word<'t>, u32)>,
-}
-
-impl<'t> Piece<'t> {
-    /// Parses from `start`; no block begins at `end` or behind it.
-    fn parse(text: &'t [u8], start: usize, end: usize, key: u64) -> Self {
-        let mut piece = Self {
-            start,
-            stop: start,
-            count: 0,
-            triangles: Vec::new(),
-            hashes: Vec::new(),
-            names: Vec::new(),
-        };
-        let mut scanner = Scanner { text, at: start };
-        let mut last_name = 0;
-        while scanner.at < end
-            && let Some((vertices, name)) = scanner.triangle()
-        {
-            if piece.names.get(last_name).is_none_or(|(known, _)| known.bytes != name.bytes) {
-                last_name = piece
-                    .names
-                    .iter()
-                    .position(|(known, _)| known.bytes == name.bytes)
-                    .unwrap_or_else(|| {
-                        piece.names.push((name, 0));
-                        piece.names.len() - 1
-                    });
-                if piece.names.len() > Self::MOST_NAMES {
-                    piece.names.pop();
-                    break;
-                }
-            }
-            piece.names[last_name].1 += 1;
-            let [a, b, c] = vertices;
-            if !is_collinear(a, b, c) {
-                piece.triangles.push(Triangle {
-                    vertices,
-                    material: last_name as u32,
-                    primitive: piece.count,
-                });
-                piece.hashes.push(hash_vertices(&vertices, key));
-            }
-            piece.count += 1;
-            piece.stop = scanner.at;
-        }
-        piece
-    }
-
-    /// Names are looked for one by one.
-    const MOST_NAMES: usize = 64;
-}
-
-/// Reads plain triangle blocks and nothing else.
-struct Scanner<'t> {
-    text: &'t [u8],
-    at: usize,
-}
-
-impl<'t> Scanner<'t> {
-    /// Reads a block and the space behind it.
-    fn triangle(&mut self) -> Option<([DVec3; 3], Word<'t>)> {
-        self.skip_word(b"triangle")?;
-        let vertices = [self.vertex()?, self.vertex()?, self.vertex()?];
-        let field = self.at;
-        self.skip_word(b"material")?;
-        let mut lexer = Lexer::new(self.text, self.at);
-        let name = lexer.next()?;
-        // What could be another field, an end word or quoted is not plain.
-        let is_plain = memchr::memchr(b'\n', &self.text[field..name.start]).is_none()
-            && !name.bytes.starts_with(b"end")
-            && name.quotes == Quotes::Bare;
-        is_plain.then_some(())?;
-        self.at = name.end;
-        self.skip_space()?;
-        self.skip_word(b"endtriangle")?;
-        Some((vertices, name))
-    }
-
-    fn vertex(&mut self) -> Option<DVec3> {
-        self.skip_word(b"vertex")?;
-        Some(DVec3::new(self.number()?, self.number()?, self.number()?))
-    }
-
-    fn byte(&self) -> u8 {
-        self.text.get(self.at).copied().unwrap_or(b' ')
-    }
-
-    /// Reads `word` and the space behind it.
-    fn skip_word(&mut self, word: &[u8]) -> Option<()> {
-        self.text[self.at..].starts_with(word).then_some(())?;
-        self.at += word.len();
-        self.skip_space()
-    }
-
-    /// Reads the space behind a word; `None` when the word goes on or the space is unusual.
-    fn skip_space(&mut self) -> Option<()> {
-        match class(self.byte()) {
-            Class::Word | Class::Wide => return None,
-            Class::Space if self.at < self.text.len() => self.at += 1,
-            Class::Space | Class::Comment => {}
-        }
-        loop {
-            match class(self.byte()) {
-                Class::Space if self.at < self.text.len() => self.at += 1,
-                Class::Word | Class::Space => return Some(()),
-                Class::Comment | Class::Wide => {
-                    let mut lexer = Lexer::new(self.text, self.at);
-                    lexer.skip_space();
-                    self.at = lexer.at();
-                    return Some(());
-                }
-            }
-        }
-    }
-
-    /// Reads a finite number and the space behind it.
-    fn number(&mut self) -> Option<f64> {
-        let number = scan_number(self.text, &mut self.at)?;
-        self.skip_space()?;
-        Some(number)
     }
 }
 
@@ -397,129 +115,28 @@ fn is_copy(
     }
 }
 
-/// The explicit texture coordinates of a triangle in the list.
+/// Finds the explicit texture coordinates of a triangle in the list.
 fn texcoords_at(texcoords: &[(u32, [DVec2; 3])], index: u32) -> Option<[DVec2; 3]> {
     let place = texcoords.binary_search_by_key(&index, |&(known, _)| known).ok()?;
     Some(texcoords[place].1)
 }
 
-/// The vertex that comes first in an order of all points; turning the triangle does not move it.
+/// Finds the vertex that comes first in an order of all points; turning the triangle does not move
+/// it.
 fn first_vertex(vertices: &[DVec3; 3]) -> usize {
     let key = |k: usize| vertices[k].to_array().map(f64::to_bits);
     let first = usize::from(key(1) < key(0));
     if key(2) < key(first) { 2 } else { first }
 }
 
-/// A hash that does not change when the triangle is turned.
-fn hash_vertices(vertices: &[DVec3; 3], key: u64) -> u64 {
+/// Hashes the vertices of a triangle; turning it does not change the hash.
+pub(super) fn hash_vertices(vertices: &[DVec3; 3], function: &HashFunction) -> u64 {
     let first = first_vertex(vertices);
-    let mut hash = key;
-    for k in 0..3 {
-        for number in vertices[(first + k) % 3].to_array() {
-            hash = mix(hash, number.to_bits());
-        }
-    }
-    hash
+    function.hash((0..3).flat_map(|k| vertices[(first + k) % 3].to_array().map(f64::to_bits)))
 }
 
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::{
-        language::reader::{Reading, read_scene_in_pieces},
-        transfer::Transfer,
-    };
-
-    /// Reads with pieces of a few bytes on two threads, with whole pieces on one thread, and
-    /// compares.
-    fn check_same(text: &str) -> Reading {
-        let read = |threads: usize, piece: usize| {
-            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-            pool.install(|| {
-                read_scene_in_pieces(
-                    text.as_bytes(),
-                    &|_| Err(std::io::ErrorKind::NotFound.into()),
-                    Transfer::None,
-                    piece,
-                )
-            })
-        };
-        let expected = read(1, usize::MAX);
-        for (threads, piece) in [(1, 1), (2, 1), (2, 100), (3, 333), (2, 1000), (2, PIECE)] {
-            let reading = read(threads, piece);
-            assert_eq!(
-                reading.diagnostics, expected.diagnostics,
-                "{threads} threads, pieces of {piece}"
-            );
-            assert_eq!(reading.omitted, expected.omitted);
-            assert_eq!(format!("{:?}", reading.scene), format!("{:?}", expected.scene));
-        }
-        expected
-    }
-
-    fn scene(shapes: impl IntoIterator<Item = String>) -> String {
-        let shapes: String = shapes.into_iter().collect();
-        format!(
-            "materials entry name a endentry entry name b endentry endmaterials\ngeometry\n{shapes}endgeometry\n"
-        )
-    }
-
-    fn triangle(k: usize) -> String {
-        let material = ["a", "b", "b"][k % 3];
-        format!(
-            "triangle\n\tvertex 0 0 {k}\n\tvertex 1 0 {k}.5\n\tvertex 0 1 {k}e-1\n\tmaterial {material}\nendtriangle\n"
-        )
-    }
-
-    #[test]
-    fn pieces_give_what_the_whole_gives() {
-        let reading = check_same(&scene((0..1000).map(triangle)));
-        assert_eq!(reading.scene.unwrap().triangles.len(), 1000);
-    }
-
-    #[test]
-    fn copies_and_flat_ones_are_found_across_pieces() {
-        let flat = "triangle vertex 0 0 0 vertex 1 1 1 vertex 2 2 2 material a endtriangle\n";
-        let reading = check_same(&scene(
-            (0..1000).map(|k| if k % 7 == 0 { flat.into() } else { triangle(k % 400) }),
-        ));
-        let scene = reading.scene.unwrap();
-        assert_eq!(
-            (scene.dropped.zero_area, scene.dropped.zero_area + scene.dropped.duplicates),
-            (143, 600)
-        );
-    }
-
-    #[test]
-    fn anything_between_plain_triangles_is_read() {
-        let odd = [
-            "# a comment\n triangle\n",
-            "sphere coords 0 0 0 radius 1 material a endsphere\n",
-            "triangle vertex 0 0 0 texcoord 0 0 vertex 1 0 0 texcoord 1 0 vertex 0 1 0 texcoord 0 1 material b endtriangle",
-            "triangle material a vertex 0 0 0 vertex 1 0 0 vertex 0 1 0 endtriangle triangle\n",
-            "triangle vertex 0 0 0\n vertex 1 0 0 vertex 0 1 x\n material\ntriangle\nendtriangle\n",
-            "union\n\n",
-            "endtriangle\n",
-            "endgeometry\ngeometry\n",
-            "triangle vertex 0 0 0 vertex 1 0 0 vertex 0 1 1e999 material a endtriangle\n",
-            "triangle vertex 0 0 0 vertex 1 0 0 vertex 0 1 0 material unknown endtriangle\n",
-            "fog\ntriangle\nendfog\n",
-            "… \u{a0}",
-        ];
-        for odd in odd {
-            for every in [1, 10, 97] {
-                check_same(&scene(
-                    (0..200).map(|k| {
-                        format!("{}{}", if k % every == 0 { odd } else { "" }, triangle(k))
-                    }),
-                ));
-            }
-        }
-    }
-
-    #[test]
-    fn triangles_on_one_line_are_read() {
-        let reading = check_same(&scene((0..500).map(|k| triangle(k).replace('\n', " "))));
-        assert_eq!(reading.scene.unwrap().triangles.len(), 500);
-    }
+/// Makes a whole hash of half a one: tables take the place from the low bits and a tag from the
+/// high.
+fn spread(half: u32) -> u64 {
+    u64::from(half) | u64::from(half) << 32
 }

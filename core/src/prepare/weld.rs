@@ -38,7 +38,7 @@ fn find_first_corners(corners: &[DVec3]) -> Vec<u32> {
     let copies: Vec<Vec<(u32, u32)>> = (0..shares)
         .into_par_iter()
         .map(|share| {
-            let mut table = PointTable::new(hasher, 0);
+            let mut table = PointTable::new(hasher.clone(), 0);
             let mut copies = Vec::new();
             for (corner, &hash) in (0_u32..).zip(&hashes) {
                 if (hash >> 32) % shares != share {

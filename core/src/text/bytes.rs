@@ -1,6 +1,6 @@
-//! What single bytes do to the words around them.
+//! Classes of bytes: what separates words and what begins a comment.
 
-/// What a byte does to the words around it.
+/// The effect of a byte on the words around it.
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Class {
     Word,
@@ -10,7 +10,7 @@ pub(crate) enum Class {
     Wide,
 }
 
-/// What `byte` does to words.
+/// Gives the class of a byte.
 pub(crate) fn class(byte: u8) -> Class {
     CLASSES[byte as usize]
 }

@@ -1,6 +1,6 @@
 //! Texts that nobody means well by: every one is answered soon, and with little memory.
 
-use rtfarm_core::read::{Reading, Style, draw_diagnostics, read_scene};
+use rtfarm_core::language::{Reading, Style, draw_diagnostics, read_scene};
 
 fn read(text: &[u8]) -> Reading {
     let reading = read_scene(text, &|_| Err(std::io::ErrorKind::NotFound.into()));
@@ -94,11 +94,11 @@ fn depth_takes_no_stack() {
 #[test]
 fn texts_in_other_encodings_are_named() {
     check_refused(b"\xff\xfeg\0e\0", "1:1", "this file is in UTF-16; save it as UTF-8");
-    check_refused(b"\x1f\x8b\x08", "1:1", "this file is compressed by gzip; unpack it first");
+    check_refused(b"\x1f\x8b\x08", "1:1", "this file is compressed with gzip; unpack it first");
     check_refused(
         b"geometry\n# \xd8\xe0\xf0\nendgeometry",
         "2:3",
-        "the byte 0xd8 is no UTF-8; save the file as UTF-8",
+        "the byte 0xd8 is not valid UTF-8; save the file as UTF-8",
     );
 }
 
@@ -106,7 +106,7 @@ fn texts_in_other_encodings_are_named() {
 fn binary_files_are_named_and_not_read() {
     let mut binary = b"solid\n".to_vec();
     binary.resize(LONG, 0);
-    check_refused(&binary, "2:1", "a NUL byte stands here: this file is no text");
+    check_refused(&binary, "2:1", "this file is not a text: it contains a NUL byte");
     assert_eq!(read(&binary).diagnostics.len(), 1);
 }
 
@@ -129,7 +129,7 @@ fn unclosed_quotes_end_with_their_line() {
     check_refused(
         b"materials entry name a texture \"x.png\nendentry endmaterials",
         "1:32",
-        "this quote is not closed on its line",
+        "this name has no closing quote on its line",
     );
 }
 
@@ -141,14 +141,14 @@ fn absurd_numbers_are_refused() {
     let digits = "9".repeat(LONG);
     check_refused(&sphere(&digits), "1:10", "this `sphere` has no `material`");
     for (radius, message) in [
-        ("1e400", "`1e400` is too large: numbers go up to about 1.8e308"),
-        ("-1e400", "`-1e400` is too large: numbers go up to about 1.8e308"),
-        ("nan", "`nan` cannot be computed with; a finite number should stand here"),
-        ("-Infinity", "`-Infinity` cannot be computed with; a finite number should stand here"),
+        ("1e400", "`1e400` is too large; the largest number is about 1.8e308"),
+        ("-1e400", "`-1e400` is too large; the largest number is about 1.8e308"),
+        ("nan", "expected a finite number, found `nan`"),
+        ("-Infinity", "expected a finite number, found `-Infinity`"),
         ("1e-400", "`radius` must be above 0, but is 0"),
         (
             "1e99999999999999999999",
-            "`1e99999999999999999999` is too large: numbers go up to about 1.8e308",
+            "`1e99999999999999999999` is too large; the largest number is about 1.8e308",
         ),
     ] {
         let reading = read(&sphere(radius));
@@ -161,7 +161,7 @@ fn light_beyond_all_numbers_is_refused() {
     check_refused(
         b"lights reference power 1e-200 distance 1 endreference\npoint coords 0 0 0 power 1e200 endpoint endlights",
         "2:1",
-        "this light is too bright to be computed with: its power over the reference's, times the \
-         reference's distance squared, is beyond 1.8e308",
+        "this light is too bright: its power divided by the reference's, times the square of the \
+         reference's distance, exceeds 1.8e308",
     );
 }

@@ -4,8 +4,8 @@ use std::io;
 
 use glam::{DVec2, DVec3};
 use rtfarm_core::{
-    read::{Reading, read_scene},
-    scene::{Dropped, Operation, Scene, SolidNode},
+    language::{Reading, read_scene},
+    scene::{DroppedFaces, Operation, Scene, SolidNode},
     tile::Size,
 };
 
@@ -169,14 +169,14 @@ geometry quadrangle material a
 vertex 0 0 0 textureCoord 0 0 0 vertex 1 0 0 textureCoord 1 0
 vertex 1 1 0 textureCoord 1 1 vertex 0 1 0 textureCoord 0 1 0 endquadrangle endgeometry",
         &[
-            "2:1: warning: `screen` is read as the corners directly in `viewport`",
+            "2:1: warning: `screen` is not needed: its corners are read as those of `viewport`",
             "3:1: warning: `resolution` is read as `size` in `viewport`",
-            "5:1: warning: `background` is read as `background` in `viewport`",
+            "5:1: warning: `background` belongs in `viewport`, and is read as if it were there",
             "7:1: warning: `backlight` is read as `ambient`",
             "8:7: warning: `position` is read as `coords`",
             "10:24: warning: `image` is read as `texture`",
-            "11:1: warning: no material here has `specular`; skipped",
-            "12:1: warning: no material here has `shininess`; skipped",
+            "11:1: warning: materials have no `specular`, so its line is skipped",
+            "12:1: warning: materials have no `shininess`, so its line is skipped",
             "15:14: warning: `textureCoord` is read as `texcoord`",
             "15:46: warning: `textureCoord` is read as `texcoord`",
             "16:14: warning: `textureCoord` is read as `texcoord`",
@@ -278,7 +278,7 @@ fn triangles_without_area_and_copies_are_dropped() {
         .map(triangle)
         .concat()
     ));
-    assert_eq!(scene.dropped, Dropped { zero_area: 2, duplicates: 2 });
+    assert_eq!(scene.dropped, DroppedFaces { zero_area: 2, duplicates: 2 });
     assert_eq!(scene.triangles.iter().map(|t| t.primitive).collect::<Vec<_>>(), [0, 2, 3, 6, 7, 9]);
     assert_eq!(scene.triangle_texcoords.iter().map(|t| t.0).collect::<Vec<_>>(), [4, 5]);
 }

@@ -10,6 +10,7 @@ mod hostile;
 mod language;
 mod meshes;
 mod mistakes;
+mod named_files;
 mod numbers;
 mod optics;
 mod pictures;

@@ -3,13 +3,13 @@
 use std::fmt::Write;
 
 use rtfarm_core::{
-    mesh_file::{MeshFault, read_mesh},
-    scene::{Dropped, MeshShape, MeshVertices},
+    assets::mesh::{MeshFault, read_mesh},
+    scene::{DroppedFaces, MeshShape, MeshVertices},
 };
 
 fn read(path: &str, bytes: impl AsRef<[u8]>) -> MeshShape {
     let file = read_mesh(path, bytes.as_ref()).unwrap_or_else(|error| panic!("{path}: {error}"));
-    assert_eq!(file.dropped, Dropped::default());
+    assert_eq!(file.dropped, DroppedFaces::default());
     file.shape
 }
 
@@ -73,7 +73,7 @@ fn stl_vertices_are_shared() {
 }
 
 #[test]
-fn notes_behind_a_binary_stl_are_skipped() {
+fn notes_after_a_binary_stl_are_skipped() {
     let mut bytes = binary_stl("made by hand", &facets());
     bytes.extend(b"colours of my own");
     assert_eq!(read("a.stl", bytes), tetrahedron());
@@ -82,25 +82,25 @@ fn notes_behind_a_binary_stl_are_skipped() {
 #[test]
 fn broken_stl_is_refused_at_its_place() {
     let binary = binary_stl("", &facets());
-    check_error("a.stl", &binary[..200], "it ends early: 284 bytes are announced, 200 are there");
-    check_error("a.stl", "", "it ends early: 84 bytes are announced, 0 are there");
-    check_error("a.stl", binary_stl("", &[]), "it holds no triangles");
-    check_error("a.stl", "solid\nendsolid", "it holds no triangles");
-    let mut infinite = facets();
-    infinite[2][1][0] = f32::INFINITY;
     check_error(
         "a.stl",
-        binary_stl("", &infinite),
-        "triangle 2: a finite number should stand here",
+        &binary[..200],
+        "it ends early: its header announces 284 bytes, but it has 200",
     );
-    check_error("a.stl", ascii_stl(&infinite), "line 19: a finite number should stand here");
+    check_error("a.stl", "", "it ends early: its header announces 84 bytes, but it has 0");
+    check_error("a.stl", binary_stl("", &[]), "it has no triangles");
+    check_error("a.stl", "solid\nendsolid", "it has no triangles");
+    let mut infinite = facets();
+    infinite[2][1][0] = f32::INFINITY;
+    check_error("a.stl", binary_stl("", &infinite), "triangle 2: expected a finite number");
+    check_error("a.stl", ascii_stl(&infinite), "line 19: expected a finite number");
     let text = ascii_stl(&facets());
     check_error(
         "a.stl",
         text.replacen("endloop", "vertex 1 2 3 endloop", 1),
-        "line 7: a facet has 3 vertices, not 4",
+        "line 7: a facet must have 3 vertices, but this one has 4",
     );
-    check_error("a.stl", &text[..120], "line 7: the text ends early");
+    check_error("a.stl", &text[..120], "line 7: the file ends early");
 }
 
 #[test]
@@ -158,7 +158,7 @@ fn equal_vertices_and_copies_become_one() {
     let text = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 -0\nv 1 0 0\nf 1 2 3\nf 2 3 4\nf 3 2 1\nf 1 2 5\nf 1 2 3 3";
     let file = read_mesh("a.obj", text.as_bytes()).unwrap();
     assert_eq!(file.shape.triangles, [[0, 1, 2], [2, 1, 0]]);
-    assert_eq!(file.dropped, Dropped { zero_area: 2, duplicates: 2 });
+    assert_eq!(file.dropped, DroppedFaces { zero_area: 2, duplicates: 2 });
 }
 
 #[test]
@@ -167,29 +167,33 @@ fn broken_obj_is_refused_at_its_line() {
     check_error(
         "a.obj",
         format!("{square}f 1 2 5"),
-        "line 5: there is no vertex 5: the file has 4",
+        "line 5: there is no vertex 5; vertices are numbered from 1, and the file has 4",
     );
     check_error(
         "a.obj",
         format!("{square}f 1 2 -5"),
-        "line 5: there is no vertex -5: the file has 4",
+        "line 5: there is no vertex -5; vertices are numbered from 1, and the file has 4",
     );
     check_error(
         "a.obj",
         format!("{square}f 0 1 2"),
-        "line 5: there is no vertex 0: the file has 4",
+        "line 5: there is no vertex 0; vertices are numbered from 1, and the file has 4",
     );
-    check_error("a.obj", format!("{square}f 1 2"), "line 5: a face has 3 corners or more, not 2");
-    check_error("a.obj", format!("{square}f 1 2 x"), "line 5: a finite number should stand here");
+    check_error(
+        "a.obj",
+        format!("{square}f 1 2"),
+        "line 5: a face must have 3 or more corners, but this one has 2",
+    );
+    check_error("a.obj", format!("{square}f 1 2 x"), "line 5: expected the number of a vertex");
     check_error(
         "a.obj",
         format!("{square}f 1 2 99999999999999999999"),
-        "line 5: a finite number should stand here",
+        "line 5: expected the number of a vertex",
     );
-    check_error("a.obj", "v 1 2\nv 0 0 0", "line 1: a finite number should stand here");
-    check_error("a.obj", "v 1 2 nan", "line 1: a finite number should stand here");
-    check_error("a.obj", square, "it holds no triangles");
-    check_error("a.txt", square, "it is no STL, OBJ or PLY file");
+    check_error("a.obj", "v 1 2\nv 0 0 0", "line 1: expected a finite number");
+    check_error("a.obj", "v 1 2 nan", "line 1: expected a finite number");
+    check_error("a.obj", square, "it has no triangles");
+    check_error("a.txt", square, "it is not an STL, OBJ or PLY file");
 }
 
 const PLY_ELEMENTS: &str = "comment by hand\nobj_info x\nelement vertex 4\nproperty float x\nproperty float y\n\
@@ -263,45 +267,75 @@ fn broken_ply_is_refused_at_its_place() {
     check_error(
         "a.ply",
         text.replace("7 3 0 1 2", "7 3 0 1 4"),
-        "line 19: there is no vertex 4: the file has 4",
+        "line 19: there is no vertex 4; vertices are numbered from 0, and the file has 4",
     );
     check_error(
         "a.ply",
         text.replace("7 3 0 1 2", "7 3 0 1 -1"),
-        "line 19: a finite number should stand here",
+        "line 19: expected a whole number of 0 or more",
     );
     check_error(
         "a.ply",
         text.replace("7 3 0 1 2", "7 2 0 1"),
-        "line 19: a face has 3 corners or more, not 2",
+        "line 19: a face must have 3 or more corners, but this one has 2",
     );
-    check_error("a.ply", text.replace("float y", "float q"), "it has no x, y and z of vertices");
+    check_error(
+        "a.ply",
+        text.replace("float y", "float q"),
+        "it has no x, y and z for its vertices",
+    );
     check_error(
         "a.ply",
         text.replace("float y", "quad y"),
-        "line 7: this line of the header cannot be understood",
+        "line 7: this line is not one of a PLY header",
     );
     check_error("a.ply", text.replace("element vertex", "element point"), "it has no vertices");
     check_error(
         "a.ply",
         text.replace("end_header", "end"),
-        "line 14: this line of the header cannot be understood",
+        "line 14: this line is not one of a PLY header",
     );
     check_error("a.ply", "ply\nformat ascii 1.0", "it has no `end_header`");
-    check_error("a.ply", &text[..text.len() - 1], "line 22: the text ends early");
+    check_error("a.ply", &text[..text.len() - 1], "line 22: the file ends early");
     for bytes in &all_plys()[1..] {
-        check_error("a.ply", &bytes[..bytes.len() - 1], "face 3: the text ends early");
+        check_error("a.ply", &bytes[..bytes.len() - 1], "face 3: the file ends early");
         assert!(read_mesh("a.ply", &bytes[..200]).is_err());
     }
 }
 
 #[test]
+fn a_comment_mark_in_a_number_is_refused_where_the_format_has_no_comments() {
+    let message = "expected a finite number";
+    let body = |from: &str, to: &str| ascii_ply().replacen(from, to, 1);
+    check_error("a.ply", body("0 1 9 0", "0 1.0# 9 0"), &format!("line 16: {message}"));
+    check_error("a.ply", body("0 1 9 0", "0 1 9# 0"), &format!("line 16: {message}"));
+    check_error("a.ply", body("7 3 0 1 2", "7 3# 0 1 2"), &format!("line 19: {message}"));
+    check_error("a.ply", ascii_ply() + "#", &format!("line 22: {message}"));
+    check_error(
+        "a.stl",
+        ascii_stl(&facets()).replacen("5e-1", "5e-1#", 1),
+        "line 13: expected a finite number",
+    );
+    // The manual of OBJ says that comments may stand anywhere.
+    let obj = "v 0 0 0# glued\nv 1 0 0 # apart\nv 0 1 0\n#f 1 2 9\nf 1 2 3#4";
+    assert_eq!(read("a.obj", obj).triangles, [[0, 1, 2]]);
+}
+
+#[test]
 fn counts_take_no_memory_before_they_are_checked() {
     let header = "ply\nformat binary_little_endian 1.0\nelement vertex 4000000000\nproperty double x\nproperty double y\nproperty double z\nend_header\n";
-    check_error("a.ply", header, "it ends early: 96000000126 bytes are announced, 127 are there");
+    check_error(
+        "a.ply",
+        header,
+        "it ends early: its header announces 96000000126 bytes, but it has 127",
+    );
     let mut stl = binary_stl("", &facets());
     stl[80..84].copy_from_slice(&u32::MAX.to_le_bytes());
-    check_error("a.stl", stl, "it ends early: 214748364834 bytes are announced, 284 are there");
+    check_error(
+        "a.stl",
+        stl,
+        "it ends early: its header announces 214748364834 bytes, but it has 284",
+    );
 }
 
 #[test]
@@ -314,7 +348,7 @@ fn a_face_of_too_many_corners_is_refused() {
     check_error(
         "a.obj",
         format!("{zigzag}v 3000 -3000 0\nf{face} 2001"),
-        "line 2002: a face that is not convex has at most 1024 corners",
+        "line 2002: a face that is not convex may have at most 1024 corners",
     );
-    assert_eq!(MeshFault::Empty.to_string(), "it holds no triangles");
+    assert_eq!(MeshFault::Empty.to_string(), "it has no triangles");
 }

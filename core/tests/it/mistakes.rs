@@ -2,7 +2,7 @@
 
 use std::io;
 
-use rtfarm_core::read::read_scene;
+use rtfarm_core::language::read_scene;
 
 /// Checks all that is told about a text.
 fn check_told(text: &str, told: &[&str]) {
@@ -27,15 +27,15 @@ const MISTAKES: &[(&str, &str, &[&str])] = &[
         "a misspelt section",
         "geometri
 endgeometri",
-        &["1:1: warning: the block `geometri` is unknown and skipped; did you mean `geometry`?"],
+        &["1:1: warning: the block `geometri` is unknown and is skipped; did you mean `geometry`?"],
     ),
     (
         "a misspelt section that ends rightly",
         "geometri
 endgeometry",
         &[
-            "1:1: error: `geometri` begins no section; did you mean `geometry`?",
-            "2:1: error: no `geometry` is open that `endgeometry` could end",
+            "1:1: error: `geometri` is not a section; did you mean `geometry`?",
+            "2:1: error: `endgeometry` ends nothing, because no `geometry` is open",
         ],
     ),
     (
@@ -45,7 +45,7 @@ endgeometry",
     radius 1
     material red
   endsphere",
-        &["1:3: error: `sphere` cannot stand here: it belongs in `geometry`"],
+        &["1:3: error: `sphere` is not allowed here; it belongs in `geometry`"],
     ),
     (
         "a second viewport",
@@ -61,7 +61,7 @@ viewport
   bottomleft -1 -1 0
   topright 1 1 0
 endviewport",
-        &["7:1: error: a scene has one `viewport`; this is one more"],
+        &["7:1: error: a scene has only one `viewport`, but this is another"],
     ),
     (
         "a viewport without a corner",
@@ -80,7 +80,7 @@ endviewport",
   bottomleft -1 -1 0
   topright -1 3 0
 endviewport",
-        &["3:3: error: the three corners of the screen are on one line"],
+        &["3:3: error: the three corners of the screen lie on one line"],
     ),
     (
         "an eye in the plane of the screen",
@@ -90,7 +90,7 @@ endviewport",
   bottomleft -1 -1 0
   topright 1 1 0
 endviewport",
-        &["2:3: error: the eye, `origin`, is in the plane of the screen"],
+        &["2:3: error: the eye, `origin`, lies in the plane of the screen"],
     ),
     (
         "a screen that is no rectangle",
@@ -101,7 +101,7 @@ endviewport",
   topright 1 1.5 0
 endviewport",
         &[
-            "3:3: warning: the screen is no rectangle: its edges at `topleft` are not at a right angle; rendered sheared",
+            "3:3: warning: the screen is not a rectangle: its edges at `topleft` are not at a right angle, so the picture is sheared",
         ],
     ),
     (
@@ -113,7 +113,9 @@ endviewport",
   bottomleft -1 -1 0
   topright 1 1 0
 endviewport",
-        &["2:8: error: a picture's sides are whole numbers from 1 to 65535, not 0"],
+        &[
+            "2:8: error: the width and the height of a picture must be whole numbers from 1 to 65535, but one is 0",
+        ],
     ),
     (
         "a size with a fraction",
@@ -124,7 +126,9 @@ endviewport",
   bottomleft -1 -1 0
   topright 1 1 0
 endviewport",
-        &["2:8: error: a picture's sides are whole numbers from 1 to 65535, not 640.5"],
+        &[
+            "2:8: error: the width and the height of a picture must be whole numbers from 1 to 65535, but one is 640.5",
+        ],
     ),
     (
         "a size beyond all pictures",
@@ -135,7 +139,9 @@ endviewport",
   bottomleft -1 -1 0
   topright 1 1 0
 endviewport",
-        &["2:8: error: a picture's sides are whole numbers from 1 to 65535, not 100000"],
+        &[
+            "2:8: error: the width and the height of a picture must be whole numbers from 1 to 65535, but one is 100000",
+        ],
     ),
     (
         "one side of two",
@@ -147,8 +153,8 @@ endviewport",
   topright 1 1 0
 endviewport",
         &[
-            "2:3: warning: `xres` is read as `size` in `viewport`",
-            "2:3: warning: `xres` without `yres` is skipped",
+            "2:3: warning: `xres` is read as the width in `size`",
+            "2:3: warning: `xres` is ignored, because there is no `yres`",
         ],
     ),
     (
@@ -160,7 +166,7 @@ endviewport",
   bottomleft -1 -1 0
   topright 1 1 0
 endviewport",
-        &["2:14: error: the parts of a colour must be 0 or more, but one is -1"],
+        &["2:14: error: the components of a colour must be 0 or more, but one is -1"],
     ),
     (
         "a missing number",
@@ -172,7 +178,7 @@ geometry
     material red
   endsphere
 endgeometry",
-        &["4:5: error: `coords` takes 3 numbers, but only 2 stand here"],
+        &["4:5: error: `coords` takes 3 numbers, but only 2 are given"],
     ),
     (
         "a number too many",
@@ -184,7 +190,7 @@ geometry
     material red
   endsphere
 endgeometry",
-        &["4:18: error: `coords` takes 3 numbers; this is one more"],
+        &["4:18: error: `coords` takes 3 numbers, but one more follows"],
     ),
     (
         "numbers with commas between",
@@ -196,7 +202,7 @@ geometry
     material red
   endsphere
 endgeometry",
-        &["4:12: error: `0,` is no number: spaces alone stand between numbers, no commas"],
+        &["4:12: error: `0,` is not a number; numbers are separated by spaces, not by commas"],
     ),
     (
         "a decimal comma",
@@ -208,7 +214,7 @@ geometry
     material red
   endsphere
 endgeometry",
-        &["5:12: error: `1,5` is no number: the decimal sign is a point, as in `1.5`"],
+        &["5:12: error: `1,5` is not a number; write its decimal point as in `1.5`"],
     ),
     (
         "a word in place of a number",
@@ -220,7 +226,7 @@ geometry
     material red
   endsphere
 endgeometry",
-        &["5:12: error: `big` is no number; `radius` takes one number"],
+        &["5:12: error: `big` is not a number; `radius` takes one number"],
     ),
     (
         "not a number",
@@ -232,7 +238,7 @@ geometry
     material red
   endsphere
 endgeometry",
-        &["5:12: error: `nan` cannot be computed with; a finite number should stand here"],
+        &["5:12: error: expected a finite number, found `nan`"],
     ),
     (
         "a number beyond all",
@@ -244,7 +250,7 @@ geometry
     material red
   endsphere
 endgeometry",
-        &["5:12: error: `1e999` is too large: numbers go up to about 1.8e308"],
+        &["5:12: error: `1e999` is too large; the largest number is about 1.8e308"],
     ),
     (
         "a negative radius",
@@ -292,7 +298,7 @@ geometry
     material red
   endsphere
 endgeometry",
-        &["6:5: warning: `radius` stands here again; this one counts"],
+        &["6:5: warning: `radius` is given again; this value replaces the earlier one"],
     ),
     (
         "a field of another shape",
@@ -306,7 +312,7 @@ geometry
   endsphere
 endgeometry",
         &[
-            "6:5: warning: `vertex` is not known in `sphere`, and its line is skipped; it belongs in `triangle`, `quadrangle` or `parallelepiped`",
+            "6:5: warning: `sphere` has no `vertex`, so its line is skipped; `vertex` belongs in `triangle`, `quadrangle` or `parallelepiped`",
         ],
     ),
     (
@@ -321,7 +327,7 @@ geometry
 endgeometry",
         &[
             "3:3: error: this `sphere` has no `radius`",
-            "5:5: warning: `raduis` is not known in `sphere`, and its line is skipped; did you mean `radius`?",
+            "5:5: warning: `sphere` has no `raduis`, so its line is skipped; did you mean `radius`?",
         ],
     ),
     (
@@ -335,11 +341,11 @@ geometry
   endsphere
 endgeometry",
         &[
-            "3:3: warning: `Sphere` is not known in `geometry`, and its line is skipped; did you mean `sphere`?",
-            "4:5: warning: `coords` is not known in `geometry`, and its line is skipped; it belongs in `point` or `sphere`",
-            "5:5: warning: `radius` is not known in `geometry`, and its line is skipped; it belongs in `sphere`",
-            "6:5: warning: `material` is not known in `geometry`, and its line is skipped; it belongs in `sphere`, `triangle`, `quadrangle` or `parallelepiped`",
-            "7:3: error: no `sphere` is open that `endsphere` could end",
+            "3:3: warning: `geometry` has no `Sphere`, so its line is skipped; did you mean `sphere`?",
+            "4:5: warning: `geometry` has no `coords`, so its line is skipped; `coords` belongs in `point` or `sphere`",
+            "5:5: warning: `geometry` has no `radius`, so its line is skipped; `radius` belongs in `sphere`",
+            "6:5: warning: `geometry` has no `material`, so its line is skipped; `material` belongs in `sphere`, `triangle`, `quadrangle` or `parallelepiped`",
+            "7:3: error: `endsphere` ends nothing, because no `sphere` is open",
         ],
     ),
     (
@@ -376,7 +382,7 @@ geometry
     material
   endsphere
 endgeometry",
-        &["6:5: error: `material` takes the name of a material, but none stands here"],
+        &["6:5: error: `material` takes the name of a material, but none is given"],
     ),
     (
         "a block that is not closed",
@@ -400,7 +406,7 @@ geometry
     material red
   endspere
 endgeometry",
-        &["7:3: error: `endspere` ends no block; did you mean `endsphere`?"],
+        &["7:3: error: no block ends with `endspere`; did you mean `endsphere`?"],
     ),
     (
         "the end of another block",
@@ -412,7 +418,7 @@ geometry
     material red
   endtriangle
 endgeometry",
-        &["7:3: error: `endtriangle` cannot end this: `endsphere` does"],
+        &["7:3: error: `endtriangle` cannot end this `sphere`; expected `endsphere`"],
     ),
     (
         "a shape that begins in another",
@@ -449,7 +455,7 @@ endlights
 endgeometry",
         &[
             "2:1: error: `endgeometry` is missing before `lights`",
-            "8:1: error: no `geometry` is open that `endgeometry` could end",
+            "8:1: error: `endgeometry` ends nothing, because no `geometry` is open",
         ],
     ),
     (
@@ -476,7 +482,7 @@ geometry
     material red
   endtriangle
 endgeometry",
-        &["7:5: error: a triangle has 3 vertices; this is one more"],
+        &["7:5: error: a triangle has 3 vertices, but this is one more"],
     ),
     (
         "texcoords on some vertices",
@@ -489,7 +495,9 @@ geometry
     material red
   endtriangle
 endgeometry",
-        &["3:3: error: every vertex has a `texcoord` or none has; here 1 of 3 have"],
+        &[
+            "3:3: error: a `texcoord` is given for 1 of 3 vertices; give one for all of them or for none",
+        ],
     ),
     (
         "texcoords before the vertex",
@@ -502,7 +510,7 @@ geometry
     material red
   endtriangle
 endgeometry",
-        &["4:5: error: `texcoord` stands behind the vertex that it belongs to"],
+        &["4:5: error: `texcoord` must come after the vertex that it belongs to"],
     ),
     (
         "a bow tie",
@@ -517,7 +525,7 @@ geometry
   endquadrangle
 endgeometry",
         &[
-            "3:3: error: the sides of this quadrangle cross or touch; its vertices must stand in their order around it",
+            "3:3: error: the sides of this quadrangle cross or touch; its vertices must go around it in order",
         ],
     ),
     (
@@ -532,7 +540,9 @@ geometry
     material red
   endquadrangle
 endgeometry",
-        &["3:3: error: this quadrangle has two vertices in one place; three make a triangle"],
+        &[
+            "3:3: error: two vertices of this quadrangle are equal; write a shape of three vertices as a `triangle`",
+        ],
     ),
     (
         "a quadrangle on one line",
@@ -546,7 +556,7 @@ geometry
     material red
   endquadrangle
 endgeometry",
-        &["3:3: error: this quadrangle has no area: its vertices are on one line"],
+        &["3:3: error: this quadrangle has no area: its vertices lie on one line"],
     ),
     (
         "a bent quadrangle",
@@ -561,7 +571,7 @@ geometry
   endquadrangle
 endgeometry",
         &[
-            "3:3: error: this quadrangle is not planar: its vertices are 2.494e-2 off their plane, and 1.005e-5 is the most; two triangles could be bent so",
+            "3:3: error: this quadrangle is not planar: its vertices are 2.494e-2 away from their plane, and at most 1.005e-5 is allowed; use two triangles instead",
         ],
     ),
     (
@@ -576,7 +586,9 @@ geometry
     material red
   endquadrangle
 endgeometry",
-        &["3:3: warning: this quadrangle is planar only to within 2.500e-7; taken as planar"],
+        &[
+            "3:3: warning: this quadrangle is planar only to within 2.500e-7, but is taken as planar",
+        ],
     ),
     (
         "a flat parallelepiped",
@@ -591,7 +603,7 @@ geometry
   endparallelepiped
 endgeometry",
         &[
-            "3:3: error: this parallelepiped has no volume: its vertices are a corner and that corner's three neighbours, not all in one plane",
+            "3:3: error: this parallelepiped has no volume; its vertices must be a corner and that corner's three neighbours, not all in one plane",
         ],
     ),
     (
@@ -607,7 +619,7 @@ geometry
   endparallelepiped
 endgeometry",
         &[
-            "3:3: error: this parallelepiped is too flat to be computed with: its condition number is 3.5e13, and 1e12 is the most",
+            "3:3: error: this parallelepiped is too flat: its condition number is 3.5e13, and at most 1e12 is allowed",
         ],
     ),
     (
@@ -622,7 +634,7 @@ geometry
   endsphere
   endunion
 endgeometry",
-        &["3:3: error: `union` joins two or more solids, but only one stands here"],
+        &["3:3: error: `union` joins two or more solids, but only one is given"],
     ),
     (
         "an operation on nothing",
@@ -631,7 +643,7 @@ geometry
   difference
   enddifference
 endgeometry",
-        &["3:3: error: `difference` joins two or more solids, but none stands here"],
+        &["3:3: error: `difference` joins two or more solids, but none is given"],
     ),
     (
         "a flat shape in an operation",
@@ -657,7 +669,7 @@ geometry
   endunion
 endgeometry",
         &[
-            "9:3: error: `union` takes solids: spheres, parallelepipeds and operations on them, no triangle",
+            "9:3: error: `triangle` is not a solid; `union` takes spheres, parallelepipeds and operations on them",
         ],
     ),
     (
@@ -679,7 +691,7 @@ geometry
   endunion
 endgeometry",
         &[
-            "4:5: warning: `material` is not known in `union`, and its line is skipped; each of the solids has its own",
+            "4:5: warning: `union` has no `material`, so its line is skipped; each solid in it has its own",
         ],
     ),
     (
@@ -703,7 +715,7 @@ geometry
   endmesh
 endgeometry",
         &[
-            "4:10: error: cannot read the mesh `broken.obj`: line 2: there is no vertex 2: the file has 1",
+            "4:10: error: cannot read the mesh `broken.obj`: line 2: there is no vertex 2; vertices are numbered from 1, and the file has 1",
         ],
     ),
     (
@@ -725,7 +737,7 @@ geometry
     material red
   endmesh
 endgeometry",
-        &["4:10: error: a file name with spaces stands in double quotes"],
+        &["4:10: error: a file name with spaces must be in double quotes"],
     ),
     (
         "a quote that is not closed",
@@ -736,7 +748,7 @@ geometry
     material red
   endmesh
 endgeometry",
-        &["4:10: error: this quote is not closed on its line"],
+        &["4:10: error: this name has no closing quote on its line"],
     ),
     (
         "a mesh scaled to nothing",
@@ -772,7 +784,7 @@ geometry
     rotate 0 0 1
   endmesh
 endgeometry",
-        &["6:5: error: `rotate` takes 4 numbers, but only 3 stand here"],
+        &["6:5: error: `rotate` takes 4 numbers, but only 3 are given"],
     ),
     (
         "a texture that is not there",
@@ -809,7 +821,7 @@ endmaterials",
   entry name red endentry
   entry name red endentry
 endmaterials",
-        &["3:14: error: a material `red` is there already"],
+        &["3:14: error: another material is already named `red`"],
     ),
     (
         "a name that begins with a digit",
@@ -817,7 +829,7 @@ endmaterials",
   entry name 1st endentry
 endmaterials",
         &[
-            "2:14: warning: `1st` is no C++ identifier (letters, digits and `_`, no digit first); taken as it is",
+            "2:14: warning: `1st` is not an identifier (letters, digits and `_`, with no digit first), but it is used as it is",
         ],
     ),
     (
@@ -827,7 +839,7 @@ endmaterials",
     name dark red
   endentry
 endmaterials",
-        &["3:15: warning: `name` takes one word; from `red` on the line is skipped"],
+        &["3:15: warning: `name` takes one word; the line is skipped from `red` on"],
     ),
     (
         "a colour beyond 255",
@@ -837,7 +849,9 @@ endmaterials",
     color 300 0 0
   endentry
 endmaterials",
-        &["4:11: warning: the parts of a colour are from 0 to 255; taken as 255 0 0"],
+        &[
+            "4:11: warning: the components of a colour go from 0 to 255; this one is taken as 255 0 0",
+        ],
     ),
     (
         "a colour of two numbers",
@@ -847,7 +861,7 @@ endmaterials",
     color 255 0
   endentry
 endmaterials",
-        &["4:5: error: `color` takes 3 numbers, but only 2 stand here"],
+        &["4:5: error: `color` takes 3 numbers, but only 2 are given"],
     ),
     (
         "a colour with a name",
@@ -857,7 +871,7 @@ endmaterials",
     color blue
   endentry
 endmaterials",
-        &["4:11: error: `blue` is no number; `color` takes 3 numbers"],
+        &["4:11: error: `blue` is not a number; `color` takes 3 numbers"],
     ),
     (
         "an alpha in percent",
@@ -867,7 +881,7 @@ endmaterials",
     alpha 50
   endentry
 endmaterials",
-        &["4:11: warning: alpha is from 0, clear, to 1, opaque; 50 is taken as 1"],
+        &["4:11: warning: `alpha` goes from 0 (clear) to 1 (opaque); 50 is taken as 1"],
     ),
     (
         "a reflect in percent",
@@ -877,7 +891,7 @@ endmaterials",
     reflect 50
   endentry
 endmaterials",
-        &["4:13: warning: reflect is from 0 to 1; 50 is read as percent, 0.5"],
+        &["4:13: warning: `reflect` goes from 0 to 1; 50 is read as a percentage, 0.5"],
     ),
     (
         "a reflect beyond percent",
@@ -887,7 +901,7 @@ endmaterials",
     reflect 500
   endentry
 endmaterials",
-        &["4:13: error: reflect must be from 0 to 1, but is 500"],
+        &["4:13: error: `reflect` must be from 0 to 1, but is 500"],
     ),
     (
         "a negative refract",
@@ -907,7 +921,7 @@ endmaterials",
     roughness 0.5
   endentry
 endmaterials",
-        &["4:5: warning: `roughness` is not known in `entry`, and its line is skipped"],
+        &["4:5: warning: `entry` has no `roughness`, so its line is skipped"],
     ),
     (
         "a light of negative power",
@@ -935,8 +949,8 @@ endlights",
   power 5
 endlights",
         &[
-            "2:3: warning: `coords` is not known in `lights`, and its line is skipped; it belongs in `point` or `sphere`",
-            "3:3: warning: `power` is not known in `lights`, and its line is skipped; it belongs in `reference` or `point`",
+            "2:3: warning: `lights` has no `coords`, so its line is skipped; `coords` belongs in `point` or `sphere`",
+            "3:3: warning: `lights` has no `power`, so its line is skipped; `power` belongs in `reference` or `point`",
         ],
     ),
     (
@@ -959,7 +973,7 @@ endlights",
     power 5
   endpoint
 endlights",
-        &["2:3: warning: this `reference` has no `distance`; taken as 1"],
+        &["2:3: warning: this `reference` has no `distance`, which is taken as 1"],
     ),
     (
         "ambient of two numbers",
@@ -970,7 +984,7 @@ endlights",
     power 5
   endpoint
 endlights",
-        &["2:11: error: `ambient` takes one number or three, but two stand here"],
+        &["2:11: error: `ambient` takes one number or three, but two are given"],
     ),
     (
         "a negative ambient",
@@ -981,7 +995,7 @@ endlights",
     power 5
   endpoint
 endlights",
-        &["2:11: error: ambient light must be 0 or more"],
+        &["2:11: error: the numbers of `ambient` must be 0 or more"],
     ),
     (
         "dots where the list goes on",
@@ -992,14 +1006,14 @@ endlights",
   endpoint
   ...
 endlights",
-        &["6:3: warning: a stray `...` is skipped"],
+        &["6:3: warning: `...` has no meaning here and is skipped"],
     ),
     (
         "a number from nowhere",
         "geometry
 5
 endgeometry",
-        &["2:1: error: a keyword should stand here, not `5`"],
+        &["2:1: error: expected a keyword, found `5`"],
     ),
     (
         "an unknown block",
@@ -1009,14 +1023,14 @@ geometry
     radius 1
   endcylinder
 endgeometry",
-        &["3:3: warning: the block `cylinder` is unknown and skipped"],
+        &["3:3: warning: the block `cylinder` is unknown and is skipped"],
     ),
     (
         "a word from another language",
         "geometry
   шар 0 0 0
 endgeometry",
-        &["2:3: warning: `шар` is not known in `geometry`, and its line is skipped"],
+        &["2:3: warning: `geometry` has no `шар`, so its line is skipped"],
     ),
 ];
 

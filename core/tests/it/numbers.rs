@@ -5,9 +5,9 @@ use glam::DVec3;
 use rayon::prelude::*;
 use rtfarm_core::{
     isa::Isa,
+    language::{Severity, read_scene},
     prepare::prepare,
     prepared::{PreparedBytes, PreparedScene},
-    read::{Severity, read_scene},
     render::{Settings, render_tile},
     scene::{Quadrangle, Scene, Sphere, Triangle},
     testing::{Probe, ProbeHit, Probing},

@@ -5,8 +5,8 @@ use std::{fs, path::Path};
 
 use glam::{DVec2, DVec3};
 use rtfarm_core::{
+    language::read_scene,
     prepared::{PreparedBytes, PreparedScene},
-    read::read_scene,
     render::{Sampling, Settings},
     sample::Samples,
     scene::{Scene, Viewport},

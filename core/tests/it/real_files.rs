@@ -3,8 +3,8 @@
 use std::{fs, path::PathBuf};
 
 use rtfarm_core::{
-    read::{Reading, Severity, read_scene},
-    scene::Dropped,
+    language::{Reading, Severity, read_scene},
+    scene::DroppedFaces,
 };
 
 fn folder() -> Option<PathBuf> {
@@ -75,6 +75,6 @@ fn a_thousand_copies_of_each_triangle_are_dropped() {
     let reading = read_scene(&unpacked.stdout, &|_| Err(std::io::ErrorKind::NotFound.into()));
     let scene = reading.scene.unwrap();
     assert_eq!(scene.triangles.len(), 1076);
-    assert_eq!(scene.dropped, Dropped { zero_area: 0, duplicates: 1_140_084 });
+    assert_eq!(scene.dropped, DroppedFaces { zero_area: 0, duplicates: 1_140_084 });
     assert_eq!(reading.diagnostics.len(), 10, "ten numbers are names of materials");
 }

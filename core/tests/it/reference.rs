@@ -2,7 +2,7 @@
 
 use std::{fs, io, path::Path};
 
-use rtfarm_core::read::read_scene;
+use rtfarm_core::language::read_scene;
 
 fn check_examples(name: &str) {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../docs").join(name);

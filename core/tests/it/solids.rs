@@ -8,9 +8,9 @@ use glam::{DMat3, DVec3};
 use rayon::prelude::*;
 use rtfarm_core::{
     isa::Isa,
+    language::read_scene,
     prepare::prepare,
     prepared::{PreparedBytes, PreparedScene},
-    read::read_scene,
     scene::Scene,
     testing::{Probe, ProbeHit, Probing},
 };

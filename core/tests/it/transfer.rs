@@ -5,7 +5,7 @@ use std::io::Cursor;
 
 use image::{DynamicImage, ImageFormat, RgbImage};
 use rtfarm_core::{
-    read::{Reading, read_scene_with},
+    language::{Reading, read_scene_with},
     render::Settings,
     scene::Scene,
     transfer::Transfer,
@@ -195,7 +195,7 @@ fn a_colour_whose_light_is_beyond_all_numbers_is_refused() {
     let sky = VIEWPORT.replace("background 255 255 255", "background 0 0 1e200");
     let told = reading(&sky, &RgbImage::new(1, 1), Transfer::Srgb).diagnostics;
     let told: Vec<_> = told.iter().map(|d| d.message.as_str()).collect();
-    assert_eq!(told, ["this colour is too bright to be computed with"]);
+    assert_eq!(told, ["this colour is too bright; the largest amount of light is about 1.8e308"]);
 }
 
 #[test]

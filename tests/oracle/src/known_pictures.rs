@@ -3,7 +3,7 @@
 use glam::{DMat2, DVec2, DVec3};
 use rayon::prelude::*;
 use rtfarm_core::{
-    read::read_scene,
+    language::read_scene,
     scene::{Scene, Texture, Viewport},
     tile::Size,
 };

@@ -1,14 +1,17 @@
 //! OBJ files: vertices and polygons; all else is skipped. Source: Wavefront, "Object Files
 //! (.obj)", Advanced Visualizer manual, appendix B1.
 
-use super::{MeshBuilder, MeshError, MeshFault, MeshFile};
+use super::{
+    builder::{MeshBuilder, MeshFile},
+    error::{MeshError, MeshFault},
+};
 use crate::text::{
     bytes::{Class, class},
     number::scan_number,
 };
 
 /// Reads a file.
-pub(crate) fn read_obj(text: &[u8]) -> Result<MeshFile, MeshError> {
+pub(super) fn read_obj(text: &[u8]) -> Result<MeshFile, MeshError> {
     let mut mesh = MeshBuilder::<f64>::with_capacity(0, 0);
     // The file's vertices by their numbers less one.
     let mut vertices: Vec<u32> = Vec::new();
@@ -52,6 +55,7 @@ pub(crate) fn read_obj(text: &[u8]) -> Result<MeshFile, MeshError> {
             let fault = MeshFault::Index {
                 index: line.index_of_corner(start, place),
                 count: vertices.len() as u64,
+                first: 1,
             };
             return Err(fault.at_byte(text, start));
         }
@@ -60,14 +64,14 @@ pub(crate) fn read_obj(text: &[u8]) -> Result<MeshFile, MeshError> {
     mesh.into_mesh()
 }
 
-/// Stands for a vertex that is not there yet.
+/// The index of a vertex that is not there yet.
 const EARLY: u32 = u32::MAX;
 
 fn is_blank(byte: u8) -> bool {
     matches!(byte, b' ' | b'\t' | b'\\')
 }
 
-/// Reads along a line, which may go on behind a backslash.
+/// Reads along a line, which goes on after a backslash.
 struct Line<'t> {
     text: &'t [u8],
     at: usize,
@@ -91,8 +95,8 @@ impl Line<'_> {
         self.at += memchr::memchr(b'\n', rest).map_or(rest.len(), |end| end + 1);
     }
 
-    /// Reads the corners of a face. `count` vertices stand before it; negative numbers count
-    /// back from those.
+    /// Reads the corners of a face that follows `count` vertices; negative numbers count back from
+    /// those.
     fn read_corners(
         &mut self,
         vertices: &[u32],
@@ -106,13 +110,14 @@ impl Line<'_> {
                 return Ok(());
             }
             let start = self.at;
-            let index =
-                self.read_index().ok_or_else(|| MeshFault::Number.at_byte(self.text, start))?;
+            let index = self
+                .read_index()
+                .ok_or_else(|| MeshFault::VertexNumber.at_byte(self.text, start))?;
             let from_zero = if index < 0 { count.cast_signed() as i64 + index } else { index - 1 };
             let corner = match usize::try_from(from_zero) {
                 Ok(place) if index != 0 => vertices.get(place).copied().unwrap_or(EARLY),
                 _ => {
-                    let fault = MeshFault::Index { index, count: count as u64 };
+                    let fault = MeshFault::Index { index, count: count as u64, first: 1 };
                     return Err(fault.at_byte(self.text, start));
                 }
             };
@@ -140,7 +145,7 @@ impl Line<'_> {
         (is_number && is_over).then_some(if is_negative { -index } else { index })
     }
 
-    /// The number of a corner in a face that was read once without a mistake.
+    /// Gives the number of a corner in a face that was read once without a mistake.
     fn index_of_corner(&self, start: usize, place: usize) -> i64 {
         let mut line = Line { text: self.text, at: start };
         let mut index = 0;

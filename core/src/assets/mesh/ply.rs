@@ -1,19 +1,22 @@
 //! PLY files, ASCII and binary in both byte orders: the vertices' x, y, z and the faces' lists of
 //! vertices; all else is skipped. Source: Turk, "The PLY Polygon File Format" (1994).
 
-use super::{MeshBuilder, MeshError, MeshFault, MeshFile, MeshPlace};
+use super::{
+    builder::{MeshBuilder, MeshFile},
+    error::{MeshError, MeshFault, MeshPlace},
+};
 use crate::text::{
     bytes::{Class, class},
-    number::scan_number,
+    number::scan_number_without_comment,
 };
 
 /// Whether bytes begin as a PLY file does.
-pub(crate) fn is_ply(bytes: &[u8]) -> bool {
+pub(super) fn is_ply(bytes: &[u8]) -> bool {
     bytes.starts_with(b"ply\n") || bytes.starts_with(b"ply\r")
 }
 
 /// Reads a file.
-pub(crate) fn read_ply(bytes: &[u8]) -> Result<MeshFile, MeshError> {
+pub(super) fn read_ply(bytes: &[u8]) -> Result<MeshFile, MeshError> {
     let header = Header::read(bytes)?;
     let vertex = header.element("vertex").ok_or(MeshFault::Missing("vertices").of_file())?;
     if vertex.count > u64::from(u32::MAX) {
@@ -21,7 +24,7 @@ pub(crate) fn read_ply(bytes: &[u8]) -> Result<MeshFile, MeshError> {
     }
     let coordinates = [b"x", b"y", b"z"].map(|name| vertex.scalar(name));
     let [Some(_), Some(_), Some(_)] = coordinates else {
-        return Err(MeshFault::Missing("x, y and z of vertices").of_file());
+        return Err(MeshFault::Missing("x, y and z for its vertices").of_file());
     };
     // What the header announces, as far as the file is long enough for it.
     let least_size = vertex.least_size(header.format).max(1);
@@ -90,6 +93,7 @@ fn read_elements<T: Copy + Into<f64>>(
                                     return Err(at(MeshFault::Index {
                                         index,
                                         count: vertex_count,
+                                        first: 0,
                                     }));
                                 }
                                 corners.push(index as u32);
@@ -128,7 +132,7 @@ fn read_elements<T: Copy + Into<f64>>(
     Ok(mesh)
 }
 
-/// How the body is written.
+/// The form of the body.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Format {
     Ascii,
@@ -174,7 +178,7 @@ impl Number {
     }
 }
 
-/// What stands before the body.
+/// The lines before the body.
 struct Header<'t> {
     format: Format,
     elements: Vec<Element<'t>>,
@@ -202,7 +206,7 @@ impl Property<'_> {
 }
 
 impl Element<'_> {
-    /// Place and type of the number called `name`.
+    /// Finds the place and the type of the number called `name`.
     fn scalar(&self, name: &[u8]) -> Option<(usize, Number)> {
         let place = self
             .properties
@@ -211,7 +215,7 @@ impl Element<'_> {
         Some((place, self.properties[place].kind))
     }
 
-    /// The least bytes that one takes.
+    /// Counts the least bytes that one takes.
     fn least_size(&self, format: Format) -> usize {
         let size = |property: &Property<'_>| match format {
             Format::Ascii => 2,
@@ -284,17 +288,17 @@ struct Body<'t> {
 }
 
 impl Body<'_> {
-    /// Whether elements from `index` on can still be there, now and then.
+    /// Checks before the first element that the file is long enough for all.
     fn check_left(&self, element: &Element<'_>, index: u64) -> Result<(), MeshError> {
         if index == 0 {
             let left = (self.bytes.len() - self.at) as u64;
-            // The last number of a text needs no space behind it.
+            // The last number of a text needs no space after it.
             let least = element
                 .count
                 .saturating_mul(element.least_size(self.format) as u64)
                 .saturating_sub(1);
             if element.properties.is_empty() && element.count > 0 {
-                return Err(MeshFault::Missing("properties").of_file());
+                return Err(MeshFault::Missing("properties for one of its elements").of_file());
             }
             if least > left {
                 let expected = least.saturating_add(self.at as u64);
@@ -311,7 +315,7 @@ impl Body<'_> {
             return self.ascii_number(kind);
         }
         let end = self.at + kind.size();
-        let bytes = self.bytes.get(self.at..end).ok_or(MeshFault::TextEnd)?;
+        let bytes = self.bytes.get(self.at..end).ok_or(MeshFault::EarlyEnd)?;
         self.at = end;
         let is_little = self.format == Format::Little;
         macro_rules! number {
@@ -349,9 +353,10 @@ impl Body<'_> {
         self.skip_space();
         let start = self.at;
         if start == self.bytes.len() {
-            return Err(MeshFault::TextEnd);
+            return Err(MeshFault::EarlyEnd);
         }
-        let number = scan_number(self.bytes, &mut self.at).ok_or(MeshFault::Number)?;
+        let number =
+            scan_number_without_comment(self.bytes, &mut self.at).ok_or(MeshFault::Number)?;
         if kind == Number::Float {
             // Rounded once, from the digits.
             let single: f32 =
@@ -367,7 +372,7 @@ impl Body<'_> {
         if number >= 0.0 && number.fract() == 0.0 && number < 1e15 {
             Ok(number as i64)
         } else {
-            Err(MeshFault::Number)
+            Err(MeshFault::Whole)
         }
     }
 }

@@ -1,9 +1,12 @@
 //! STL files. Source: 3D Systems, "Stereo Lithography Interface Specification" (1989).
 
-use super::{MeshBuilder, MeshError, MeshFault, MeshFile, MeshPlace};
+use super::{
+    builder::{MeshBuilder, MeshFile},
+    error::{MeshError, MeshFault, MeshPlace},
+};
 use crate::text::{
     bytes::{Class, class},
-    number::scan_number,
+    number::scan_number_without_comment,
 };
 
 /// A header of 80 bytes and the number of triangles.
@@ -13,12 +16,12 @@ const HEADER: usize = 84;
 const FACET: usize = 50;
 
 /// Whether bytes look like STL.
-pub(crate) fn is_stl(bytes: &[u8]) -> bool {
+pub(super) fn is_stl(bytes: &[u8]) -> bool {
     binary_length(bytes) == Some(bytes.len() as u64) || starts_as_text(bytes)
 }
 
 /// Reads a binary or ASCII file. Binary ones may begin with `solid` too, so their length decides.
-pub(crate) fn read_stl(bytes: &[u8]) -> Result<MeshFile, MeshError> {
+pub(super) fn read_stl(bytes: &[u8]) -> Result<MeshFile, MeshError> {
     let binary_length = binary_length(bytes);
     let head = &bytes[..bytes.len().min(1024)];
     let is_text = starts_as_text(bytes)
@@ -88,7 +91,7 @@ fn read_ascii(text: &[u8]) -> Result<MeshFile, MeshError> {
                 let mut position = [0.0; 3];
                 for number in &mut position {
                     at = skip_space(text, at);
-                    *number = scan_number(text, &mut at)
+                    *number = scan_number_without_comment(text, &mut at)
                         .ok_or_else(|| MeshFault::Number.at_byte(text, at))?;
                 }
                 if let Some(corner) = corners.get_mut(count as usize) {
@@ -112,7 +115,7 @@ fn read_ascii(text: &[u8]) -> Result<MeshFile, MeshError> {
         }
     }
     if count > 0 {
-        return Err(MeshFault::TextEnd.at_byte(text, text.len()));
+        return Err(MeshFault::EarlyEnd.at_byte(text, text.len()));
     }
     mesh.into_mesh()
 }

@@ -168,7 +168,7 @@ mod tests {
         *,
     };
     use crate::{
-        language::reader::read_scene,
+        language::read_scene,
         prepare::prepare,
         prepared::{PreparedBytes, PreparedScene},
     };

@@ -4,9 +4,9 @@ use std::ops::ControlFlow;
 
 use rtfarm_core::{
     isa::Isa,
+    language::read_scene,
     prepare::prepare,
     prepared::{PreparedBytes, PreparedScene},
-    read::read_scene,
     render::{Quality, Sampling, Settings, render_tile},
     scene::Scene,
     tile::{Area, Size},

@@ -1,0 +1,193 @@
+//! Vertices and polygons as a file gives them into a mesh without copies.
+
+use hashbrown::hash_table::Entry;
+
+use glam::DVec3;
+
+use super::error::{MeshError, MeshFault};
+use crate::{
+    exact::{
+        polygon,
+        predicates::is_collinear,
+        welding::{PointHasher, PointTable},
+    },
+    scene::{DroppedFaces, MeshShape, MeshVertices},
+};
+
+/// What a mesh file gave.
+#[derive(Debug, Clone, PartialEq)]
+pub struct MeshFile {
+    /// Its faces.
+    pub shape: MeshShape,
+    /// Faces that were left out.
+    pub dropped: DroppedFaces,
+}
+
+/// A mesh that grows: equal vertices become one, triangles without area and copies are dropped.
+#[derive(Debug)]
+pub(super) struct MeshBuilder<T> {
+    vertices: Vec<[T; 3]>,
+    vertex_table: PointTable,
+    triangles: Vec<[u32; 3]>,
+    dropped: DroppedFaces,
+}
+
+impl<T: Copy + Into<f64>> MeshBuilder<T> {
+    /// Starts an empty mesh. It may grow to the given sizes without moving; they must not be taken
+    /// from a file without a check.
+    pub(super) fn with_capacity(vertices: usize, triangles: usize) -> Self {
+        Self {
+            vertices: Vec::with_capacity(vertices),
+            vertex_table: PointTable::new(PointHasher::new(), vertices),
+            triangles: Vec::with_capacity(triangles),
+            dropped: DroppedFaces::default(),
+        }
+    }
+
+    /// Finds or adds the vertex at a finite position, in which no zero is negative, and gives its
+    /// index.
+    pub(super) fn add_vertex(&mut self, position: [T; 3]) -> Result<u32, MeshFault> {
+        let vertices = &self.vertices;
+        let bits = |position: &[T; 3]| position.map(|number| number.into().to_bits());
+        let bits_at = |index: u32| bits(&vertices[index as usize]);
+        match self.vertex_table.entry(bits(&position), bits_at) {
+            Entry::Occupied(known) => Ok(*known.get()),
+            Entry::Vacant(place) => {
+                let index = u32::try_from(vertices.len()).map_err(|_| MeshFault::TooLarge)?;
+                place.insert(index);
+                self.vertices.push(position);
+                Ok(index)
+            }
+        }
+    }
+
+    /// Adds a triangle with corners that [`MeshBuilder::add_vertex`] gave.
+    pub(super) fn add_triangle(&mut self, corners: [u32; 3]) -> Result<(), MeshFault> {
+        let [a, b, c] = corners.map(|corner| self.position(corner));
+        if is_collinear(a, b, c) {
+            self.dropped.zero_area += 1;
+            return Ok(());
+        }
+        if self.triangles.len() == u32::MAX as usize {
+            return Err(MeshFault::TooLarge);
+        }
+        self.triangles.push(corners);
+        Ok(())
+    }
+
+    /// Adds a polygon cut into triangles.
+    pub(super) fn add_polygon(&mut self, corners: &[u32]) -> Result<(), MeshFault> {
+        match *corners {
+            [a, b, c] => return self.add_triangle([a, b, c]),
+            [] | [_] | [_, _] => return Err(MeshFault::FewCorners(corners.len() as u64)),
+            _ => {}
+        }
+        let points: Vec<DVec3> = corners.iter().map(|&corner| self.position(corner)).collect();
+        let mut result = Ok(());
+        let is_cut = polygon::triangulate(&points, |triangle| {
+            if result.is_ok() {
+                result = self.add_triangle(triangle.map(|k| corners[k]));
+            }
+        });
+        if is_cut { result } else { Err(MeshFault::ManyCorners) }
+    }
+
+    fn position(&self, index: u32) -> DVec3 {
+        DVec3::from(self.vertices[index as usize].map(Into::into))
+    }
+
+    /// Drops every copy of an earlier triangle. Only triangles of one smallest corner can be equal,
+    /// and those are few and near each other: this costs less than a table of all.
+    fn drop_copies(&mut self) {
+        let triangles = &self.triangles;
+        // How many triangles have each smallest corner, then where those begin in `order`.
+        let mut starts = vec![0_u32; self.vertices.len() + 1];
+        for &triangle in triangles {
+            starts[turned(triangle)[0] as usize] += 1;
+        }
+        let mut sum = 0;
+        for start in &mut starts {
+            sum += *start;
+            *start = sum;
+        }
+        let mut order = vec![0_u32; triangles.len()];
+        for (index, &triangle) in triangles.iter().enumerate().rev() {
+            let start = &mut starts[turned(triangle)[0] as usize];
+            *start -= 1;
+            order[*start as usize] = index as u32;
+        }
+        let mut copies: Vec<u32> = Vec::new();
+        for bounds in starts.windows(2) {
+            let group = &mut order[bounds[0] as usize..bounds[1] as usize];
+            group.sort_unstable_by_key(|&index| (turned(triangles[index as usize]), index));
+            let is_copy = |pair: &&[u32]| {
+                turned(triangles[pair[0] as usize]) == turned(triangles[pair[1] as usize])
+            };
+            copies.extend(group.windows(2).filter(is_copy).map(|pair| pair[1]));
+        }
+        if copies.is_empty() {
+            return;
+        }
+        self.dropped.duplicates += copies.len() as u64;
+        copies.sort_unstable();
+        let mut copies = copies.into_iter().peekable();
+        let mut index = 0;
+        self.triangles.retain(|_| {
+            let is_copy = copies.next_if_eq(&index).is_some();
+            index += 1;
+            !is_copy
+        });
+    }
+
+    fn finish(
+        mut self,
+        vertices: impl FnOnce(Vec<[T; 3]>) -> MeshVertices,
+    ) -> Result<MeshFile, MeshError> {
+        if self.triangles.is_empty() {
+            return Err(MeshFault::Empty.of_file());
+        }
+        self.vertex_table = PointTable::new(PointHasher::new(), 0); // Its memory is needed.
+        self.drop_copies();
+        let (mut kept, mut triangles) = (self.vertices, self.triangles);
+        kept.shrink_to_fit();
+        triangles.shrink_to_fit();
+        Ok(MeshFile {
+            shape: MeshShape { vertices: vertices(kept), triangles },
+            dropped: self.dropped,
+        })
+    }
+}
+
+impl MeshBuilder<f32> {
+    /// Finishes the mesh, which must not be empty.
+    pub(super) fn into_mesh(self) -> Result<MeshFile, MeshError> {
+        self.finish(MeshVertices::Single)
+    }
+}
+
+impl MeshBuilder<f64> {
+    /// Finishes the mesh, which must not be empty.
+    pub(super) fn into_mesh(self) -> Result<MeshFile, MeshError> {
+        self.finish(|vertices| {
+            let is_single = |&number: &f64| f64::from(number as f32).to_bits() == number.to_bits();
+            if vertices.iter().flatten().all(is_single) {
+                MeshVertices::Single(
+                    vertices.iter().map(|vertex| vertex.map(|number| number as f32)).collect(),
+                )
+            } else {
+                MeshVertices::Double(vertices)
+            }
+        })
+    }
+}
+
+/// Turns a triangle so that it begins with its smallest index.
+fn turned([a, b, c]: [u32; 3]) -> [u32; 3] {
+    if a <= b && a <= c {
+        [a, b, c]
+    } else if b <= c {
+        [b, c, a]
+    } else {
+        [c, a, b]
+    }
+}
