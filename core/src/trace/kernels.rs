@@ -39,7 +39,8 @@ mod tests {
             }
             for axis in 0..3 {
                 let low = grid_or_any(random);
-                let thickness = [0.0, f64::from(f32::EPSILON), 0.25, 1.0][random.below(4)];
+                let thin = [0.0, f64::from(f32::EPSILON), 0.25];
+                let thickness = thin.get(random.below(8)).copied().unwrap_or(1.0);
                 node.planes[axis][child] = low as f32;
                 node.planes[axis + 3][child] = (low + thickness) as f32;
             }
@@ -56,17 +57,18 @@ mod tests {
         }
     }
 
-    /// Rays from everywhere, along axes and planes too, of any reach.
+    /// Rays from everywhere, of any reach: most towards the boxes, some along axes and planes, some
+    /// from afar, some that stand still.
     fn random_ray(random: &mut Random) -> BoxRay {
-        let origin = DVec3::from_array([(); 3].map(|()| match random.below(8) {
-            0 => 1e9 * grid_or_any(random),
-            _ => grid_or_any(random),
-        }));
-        let direction = DVec3::from_array([(); 3].map(|()| match random.below(4) {
-            0 => 0.0,
-            1 => -0.0,
-            _ => random.between(-1.0, 1.0),
-        }));
+        let mut point = || DVec3::from_array([(); 3].map(|()| grid_or_any(random)));
+        let (mut origin, target) = (point(), point());
+        let mut direction = target - origin;
+        match random.below(8) {
+            0 => origin -= 1e9 * direction,
+            1 => direction.x = 0.0,
+            2 => (direction.y, direction.z) = (-0.0, 0.0),
+            _ => {}
+        }
         let length = direction.length();
         let direction = if length > 0.0 { direction / length } else { direction };
         let reach = [f64::INFINITY, 0.5, 3.0, f64::MIN_POSITIVE][random.below(4)];
@@ -104,6 +106,6 @@ mod tests {
                 assert_eq!(find(isa), scalar, "{isa}: {input:?}");
             }
         }
-        assert!(met > 10_000, "{met} of 160,000 boxes are met");
+        assert!(met > 2_000, "{met} of 160,000 boxes are met");
     }
 }
