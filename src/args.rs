@@ -90,7 +90,7 @@ pub(crate) struct ReportArgs {
 
     /// The error of SCENE's picture that is wanted, where 1 is full light; some by default.
     #[arg(long, value_name = "ERROR", value_parser = parse_error)]
-    pub(crate) wanted: Option<f64>,
+    pub(crate) wanted: Option<StandardError>,
 }
 
 /// What picture is wanted.

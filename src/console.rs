@@ -10,7 +10,12 @@ use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use rtfarm_core::language::Style;
 use rtfarm_job::Progress;
 use tokio::time::Instant;
-use tracing_subscriber::{EnvFilter, fmt::MakeWriter};
+use tracing_subscriber::{
+    filter::{LevelFilter, Targets},
+    fmt::MakeWriter,
+    layer::SubscriberExt,
+    util::SubscriberInitExt,
+};
 
 use crate::args::{Command, LogFormat};
 
@@ -36,16 +41,16 @@ impl Console {
             && format == LogFormat::Text
             && io::stderr().is_terminal();
         let is_local_worker = matches!(command, Command::Worker(args) if args.parent.is_some());
-        let level = if has_bar || is_local_worker { "warn" } else { "info" };
+        let level = if has_bar || is_local_worker { LevelFilter::WARN } else { LevelFilter::INFO };
         let console = Self { wants_bar: has_bar, ..Self::default() };
-        let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new(level));
+        let filter = filter(std::env::var("RUST_LOG").ok().as_deref(), level);
         let lines = tracing_subscriber::fmt()
-            .with_env_filter(filter)
+            .with_max_level(LevelFilter::TRACE)
             .with_target(false)
             .with_writer(console.clone());
         match format {
-            LogFormat::Text => lines.init(),
-            LogFormat::Json => lines.json().flatten_event(true).init(),
+            LogFormat::Text => lines.finish().with(filter).init(),
+            LogFormat::Json => lines.json().flatten_event(true).finish().with(filter).init(),
         }
         console
     }
@@ -158,5 +163,37 @@ impl Drop for LineWriter {
             Some(bar) => bar.suspend(write),
             None => write(),
         }
+    }
+}
+
+/// The levels and targets of log lines: those that `RUST_LOG` names, like `info` or
+/// `rtfarm_worker=debug,warn`; lines up to `level` when it names none.
+fn filter(rust_log: Option<&str>, level: LevelFilter) -> Targets {
+    let chosen = rust_log.and_then(|directives| directives.parse().ok());
+    chosen.unwrap_or_else(|| Targets::new().with_default(level))
+}
+
+#[cfg(test)]
+mod tests {
+    use tracing::Level;
+
+    use super::*;
+
+    fn check_levels(rust_log: Option<&str>, worker: Level, others: Level) {
+        let filter = filter(rust_log, LevelFilter::WARN);
+        for (target, most) in [("rtfarm_worker::run", worker), ("rtfarm", others)] {
+            for level in [Level::ERROR, Level::WARN, Level::INFO, Level::DEBUG, Level::TRACE] {
+                let shown = filter.would_enable(target, &level);
+                assert_eq!(shown, level <= most, "{rust_log:?}: {target} {level}");
+            }
+        }
+    }
+
+    #[test]
+    fn rust_log_chooses_the_lines() {
+        check_levels(None, Level::WARN, Level::WARN);
+        check_levels(Some("info"), Level::INFO, Level::INFO);
+        check_levels(Some("rtfarm_worker=debug,error"), Level::DEBUG, Level::ERROR);
+        check_levels(Some("rtfarm_worker=loudly"), Level::WARN, Level::WARN);
     }
 }

@@ -463,9 +463,9 @@ fn bad_input_gives_one_clear_line_and_an_exit_code() {
         ("scene.rt", "o.png", "--size=100000x100000", 2, "not 100000x100000"),
         ("scene.rt", "o.png", "--size=1e3x5", 2, "a size looks like 1280x720"),
         ("scene.rt", "o.png", "--tile=2", 2, "2 is not in 4..=1024"),
-        ("scene.rt", "o.png", "--samples=0", 2, "0 is not in 1..=65536"),
-        ("scene.rt", "o.png", "--error=0", 2, "an error is above 0 and at most 1"),
-        ("scene.rt", "o.png", "--max-samples=7", 2, "7 is not in 8..=65536"),
+        ("scene.rt", "o.png", "--samples=0", 2, "must be a whole number from 1 to 65536"),
+        ("scene.rt", "o.png", "--error=0", 2, "must be a number above 0 and at most 1"),
+        ("scene.rt", "o.png", "--max-samples=7", 2, "must be a whole number from 8 to 65536"),
         ("scene.rt", "o.png", "--isa=mmx", 2, "`mmx` is not an instruction set"),
         ("scene.rt", "o.png", "--wokers=2", 2, "unexpected argument '--wokers'"),
     ] {

@@ -1,6 +1,6 @@
 //! Light that faces send on: how much sooner a picture is as good when rays are aimed at emitters
-//! and sent where they count, against one ray from every place over its whole sky by the same
-//! kernel; and how far off single pixels are.
+//! than when all go over the whole hemisphere, by the same kernel; and how far off single pixels
+//! are.
 //!
 //!     cargo bench -p rtfarm-core --bench secondary
 //!

@@ -2,7 +2,7 @@
 
 use std::fmt::Write;
 
-use rtfarm_core::isa::Isa;
+use rtfarm_core::{isa::Isa, render::StandardError};
 
 use crate::{
     Ladder, Rung,
@@ -97,7 +97,7 @@ fn row(rung: &Rung) -> String {
 }
 
 /// The section that says which setting comes first to `wanted`, or to each of [`WANTED`].
-pub fn soonest(ladder: &Ladder, wanted: Option<f64>) -> String {
+pub fn soonest(ladder: &Ladder, wanted: Option<StandardError>) -> String {
     let full_size = ladder.reference.map_or(ladder.size, |reference| reference.full_size);
     let larger = full_size.pixel_count() as f64 / ladder.size.pixel_count() as f64;
     let mut text = format!(
@@ -107,7 +107,7 @@ pub fn soonest(ladder: &Ladder, wanted: Option<f64>) -> String {
         ladder.size
     );
     let steps = WANTED.map(|steps| (format!("{steps}/255"), steps / 255.0));
-    let wanted = wanted.map_or(steps.to_vec(), |error| vec![(format!("{error}"), error)]);
+    let wanted = wanted.map_or(steps.to_vec(), |error| vec![(error.to_string(), error.get())]);
     for (name, wanted) in wanted {
         let good = ladder.rungs().filter(|rung| rung.rmse().0 <= wanted);
         let found = good.min_by(|a, b| a.time().total_cmp(&b.time()));

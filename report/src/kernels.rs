@@ -46,9 +46,9 @@ impl Aim {
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Amount {
     pub(crate) rays: usize,
-    /// Of those the ones whose true distance is worked out.
+    /// The ones among them whose true distance is worked out.
     pub(crate) exact: usize,
-    /// Of those the ones that the textbook's tests, which try every face, get.
+    /// The ones among them that the textbook's tests get, which try every face.
     pub(crate) textbook: usize,
     pub(crate) runs: usize,
 }

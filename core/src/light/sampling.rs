@@ -38,6 +38,7 @@ const MOST_HEMISPHERE: f64 = 0.6;
 /// Decides with which probability, above 0 and up to 1, the whole hemisphere is sampled where
 /// emitters have this importance. It weighs the deviation of what the hemisphere brings against
 /// that of what the sampled emitters bring, which is about its mean.
+#[inline]
 fn hemisphere_probability(importance: &Importance) -> f64 {
     let deviation = importance.mean_square.sqrt();
     // `max` makes a number of 0/0, where nothing has importance.
@@ -51,6 +52,7 @@ fn hemisphere_probability(importance: &Importance) -> f64 {
 /// Source: Veach & Guibas, "Optimally Combining Sampling Techniques for Monte Carlo Rendering"
 /// (1995): the balance heuristic, here for the light of each emitter on its own, so that only the
 /// chosen one's density must be known.
+#[inline]
 pub(super) fn sample_light(
     view: &View<'_>,
     receiver: &Receiver,
@@ -93,6 +95,7 @@ pub(super) fn sample_light(
 /// [`sample_light`] chooses `direction` for what an emitter gives that is met at `distance`.
 /// `hemisphere` is the probability, below 1, with which the whole hemisphere is sampled. A face
 /// that is no emitter on record, whose index is `None`, is never sampled itself.
+#[inline]
 pub(super) fn density(
     view: &View<'_>,
     receiver: &Receiver,
@@ -136,6 +139,7 @@ fn relative_density(
 
 /// Chooses a direction with the density cosine / π, by two numbers in 0..1. It is `None` where
 /// rounding leads below the horizon.
+#[inline]
 fn sample_hemisphere(
     receiver: &Receiver,
     hemisphere_probability: f64,
@@ -174,6 +178,7 @@ impl Cone {
 }
 
 /// Chooses a direction uniformly in the cone in which the sphere is seen, by two numbers in 0..1.
+#[inline]
 fn sample_sphere(emitter: &EmitterRecord, receiver: &Receiver, numbers: [f64; 2]) -> Option<DVec3> {
     let Cone { axis, height } = Cone::of_sphere(emitter, receiver)?;
     let [x, y] = to_disc(numbers);
@@ -187,6 +192,7 @@ fn sample_sphere(emitter: &EmitterRecord, receiver: &Receiver, numbers: [f64; 2]
 
 /// Chooses a point uniformly on the polygon, by two numbers in 0..1: the direction towards it and
 /// its distance, above 0.
+#[inline]
 fn sample_polygon(
     view: &View<'_>,
     emitter: &EmitterRecord,
@@ -216,6 +222,7 @@ fn to_polygon(corners: &[DVec3; 4], [u, v]: [f64; 2]) -> DVec3 {
 /// Maps the unit square uniformly to the unit disc.
 ///
 /// Source: Shirley & Chiu, "A Low Distortion Map Between Disk and Square" (1997).
+#[inline]
 fn to_disc([u, v]: [f64; 2]) -> [f64; 2] {
     let (a, b) = (2.0 * u - 1.0, 2.0 * v - 1.0);
     if a == 0.0 && b == 0.0 {

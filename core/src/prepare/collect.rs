@@ -20,7 +20,7 @@ pub(super) struct Collected {
 
 impl Collected {
     /// Collects the faces of a scene: those of meshes where the scene places them.
-    pub(super) fn new(scene: &Scene, ranks: &Ranks) -> Self {
+    pub(crate) fn new(scene: &Scene, ranks: &Ranks) -> Self {
         let mut corners: Vec<DVec3> =
             scene.triangles.iter().flat_map(|face| face.vertices).collect();
         let of_primitive = |material: u32, primitive: u32| FaceAttributes {

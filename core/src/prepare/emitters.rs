@@ -1,16 +1,16 @@
-//! Which faces of a scene send light on, and about how much.
+//! Faces that send light on, and about how much each does.
 
 use glam::{DVec2, DVec3};
 
 use super::{
-    emitter_tree::{EmitterBounds, build_emitter_tree},
+    emitter_tree::{EmitterBounds, EmitterTree},
     sort::Sorted,
 };
 use crate::{
     exact::clip::clip,
     prepared::{
         face::Part,
-        record::{EmitterNode, EmitterRecord, LightRecord, MaterialRecord, NO_NODE},
+        record::{EmitterNode, EmitterRecord, LightRecord, MaterialRecord},
     },
 };
 
@@ -82,7 +82,18 @@ struct Search<'a> {
     materials: &'a [MaterialRecord],
     lights: &'a [LightRecord],
     ambient: DVec3,
-    found: Vec<(EmitterRecord, EmitterBounds)>,
+    found: Vec<(Emitter, EmitterBounds)>,
+}
+
+/// The part of an emitter's record that is known before all of them are found; its centre is that
+/// of its bounds.
+struct Emitter {
+    vector_area: DVec3,
+    size: f64,
+    radiosity: [f64; 2],
+    vertices: [u32; 4],
+    rank: u32,
+    shape: u32,
 }
 
 impl<'a> Search<'a> {
@@ -133,18 +144,15 @@ impl<'a> Search<'a> {
         }
         let reach = |&corner: &DVec3| (corner - middle).length();
         let radius = outline.iter().map(reach).fold(0.0, f64::max);
-        let record = EmitterRecord {
-            middle: middle.to_array(),
-            vector_area: vector_area.to_array(),
+        let emitter = Emitter {
+            vector_area,
             size: area,
             radiosity: received.map(|light| self.radiosity(material, light)),
             vertices,
             rank,
             shape: if is_triangle { EmitterRecord::TRIANGLE } else { EmitterRecord::QUADRANGLE },
-            node: NO_NODE,
-            by_size: 0,
         };
-        self.found.push((record, EmitterBounds { center: middle, radius, area }));
+        self.add(emitter, middle, radius, area);
     }
 
     /// Adds a sphere, if it sends light on. Only its outside is aimed at.
@@ -167,31 +175,44 @@ impl<'a> Search<'a> {
                 received += DVec3::from_array(light.intensity) * (times / (radius * radius));
             }
         }
-        let record = EmitterRecord {
-            middle: center.to_array(),
-            vector_area: [0.0; 3],
+        let emitter = Emitter {
+            vector_area: DVec3::ZERO,
             size: radius,
             radiosity: [self.radiosity(material, received); 2],
             vertices: [0; 4],
             rank,
             shape: EmitterRecord::SPHERE,
-            node: NO_NODE,
-            by_size: 0,
         };
         let area = 4.0 * std::f64::consts::PI * (radius * radius);
-        self.found.push((record, EmitterBounds { center, radius, area }));
+        self.add(emitter, center, radius, area);
     }
 
-    /// Sorts what was found and builds the tree.
+    fn add(&mut self, emitter: Emitter, center: DVec3, radius: f64, area: f64) {
+        let [front, back] = emitter.radiosity;
+        let power = area * front.max(back);
+        self.found.push((emitter, EmitterBounds { center, radius, area, power }));
+    }
+
+    /// Sorts what was found, builds the tree and makes the records.
     fn finish(mut self) -> Emitters {
-        self.found.sort_unstable_by_key(|(record, _)| record.rank);
-        let (mut records, bounds): (Vec<EmitterRecord>, Vec<_>) = self.found.into_iter().unzip();
-        let mut by_size: Vec<u32> = (0..records.len() as u32).collect();
+        self.found.sort_unstable_by_key(|(emitter, _)| emitter.rank);
+        let (emitters, bounds): (Vec<_>, Vec<_>) = self.found.into_iter().unzip();
+        let mut by_size: Vec<u32> = (0..bounds.len() as u32).collect();
         by_size.sort_by(|&a, &b| bounds[b as usize].area.total_cmp(&bounds[a as usize].area));
-        for (emitter, by_size) in records.iter_mut().zip(by_size) {
-            emitter.by_size = by_size;
-        }
-        let nodes = build_emitter_tree(&mut records, &bounds);
+        let EmitterTree { nodes, leaves } = EmitterTree::new(&bounds);
+        let records = (emitters.into_iter().zip(bounds).zip(leaves).zip(by_size))
+            .map(|(((emitter, bounds), node), by_size)| EmitterRecord {
+                middle: bounds.center.to_array(),
+                vector_area: emitter.vector_area.to_array(),
+                size: emitter.size,
+                radiosity: emitter.radiosity,
+                vertices: emitter.vertices,
+                rank: emitter.rank,
+                shape: emitter.shape,
+                node,
+                by_size,
+            })
+            .collect();
         Emitters { records, nodes }
     }
 

@@ -74,7 +74,7 @@ impl FlatFaces {
     }
 
     /// The place of a face in the order of all faces.
-    pub(super) fn rank(&self, face: usize) -> u32 {
+    pub(crate) fn rank(&self, face: usize) -> u32 {
         self.attributes[face].rank
     }
 }

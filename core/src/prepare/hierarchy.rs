@@ -25,7 +25,7 @@ pub(super) struct Hierarchy {
 
 impl Hierarchy {
     /// Builds the hierarchy.
-    pub(super) fn new(surfaces: &Surfaces) -> Self {
+    pub(crate) fn new(surfaces: &Surfaces) -> Self {
         let frame = frame_around(surfaces);
         let mut primitives = build_primitives(surfaces, &frame);
         let nodes = build_bvh(&mut primitives);

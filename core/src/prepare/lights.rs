@@ -20,7 +20,7 @@ pub(super) struct Lights {
 
 impl Lights {
     /// Scales lights like all faces and finds the surfaces that they lie on.
-    pub(super) fn new(lights: &[Light], scale: f64, faces: &Sorted) -> Result<Self, PrepareError> {
+    pub(crate) fn new(lights: &[Light], scale: f64, faces: &Sorted) -> Result<Self, PrepareError> {
         let mut records = Vec::with_capacity(lights.len());
         let mut coincident = Vec::new();
         for (k, light) in lights.iter().enumerate() {

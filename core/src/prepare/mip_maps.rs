@@ -15,7 +15,7 @@ use crate::{
 pub(crate) struct MipMaps {
     /// The images' texels become light by this.
     pub(crate) transfer: Transfer,
-    pub(crate) textures: Vec<TextureRecord>,
+    pub(super) textures: Vec<TextureRecord>,
     pub(crate) levels: Vec<LevelRecord>,
     /// The texels of the images themselves: red, green, blue as their files have them, and 0.
     pub(crate) fine: Vec<[u8; 4]>,

@@ -16,7 +16,7 @@ pub(super) struct Ranks {
 
 impl Ranks {
     /// The order of a scene's faces, unless there are too many to number.
-    pub(super) fn new(scene: &Scene) -> Result<Self, PrepareError> {
+    pub(crate) fn new(scene: &Scene) -> Result<Self, PrepareError> {
         let counts = (scene.parallelepipeds.iter().map(|solid| (solid.primitive, 6)))
             .chain(
                 scene.meshes.iter().map(|mesh| (mesh.primitive, mesh.shape.triangles.len() as u64)),

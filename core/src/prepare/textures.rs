@@ -22,7 +22,7 @@ pub(super) struct Textures {
 
 impl Textures {
     /// Finds the faces that show images, and halves these images down to one texel.
-    pub(super) fn new(scene: &Scene, ranks: &Ranks) -> Self {
+    pub(crate) fn new(scene: &Scene, ranks: &Ranks) -> Self {
         let is_textured = |material: u32| scene.materials[material as usize].texture.is_some();
         let triangle_texcoords: HashMap<u32, [DVec2; 3]> =
             scene.triangle_texcoords.iter().copied().collect();

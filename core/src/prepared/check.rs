@@ -26,7 +26,7 @@ pub(super) fn check(view: &View<'_>) -> Result<(), &'static str> {
     ensure(finite(&header.frame.origin), "the frame")?;
 
     let mut levels = vec![0_u8; view.nodes.len()];
-    *levels.first_mut().ok_or("no root")? = 1;
+    *levels.get_mut(Node::ROOT).ok_or("no root")? = 1;
     for (index, node) in view.nodes.iter().enumerate() {
         ensure(levels[index] > 0, "a node without a parent")?;
         ensure(node.planes.as_flattened().iter().all(|x| !x.is_nan()), "a box")?;

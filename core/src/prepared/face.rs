@@ -86,6 +86,7 @@ impl Face {
     }
 
     /// The surface that it belongs to.
+    #[inline]
     pub(crate) fn surface(self, view: &View<'_>) -> Surface {
         let index = self.item.index();
         match self.item.kind() {
@@ -102,11 +103,13 @@ impl Face {
     }
 
     /// Its material.
+    #[inline]
     pub(crate) fn material<'a>(self, view: &View<'a>) -> &'a MaterialRecord {
         &view.materials[self.material_index(view) as usize]
     }
 
     /// Its material's place among all materials.
+    #[inline]
     pub(crate) fn material_index(self, view: &View<'_>) -> u32 {
         let index = self.item.index();
         match self.item.kind() {
@@ -120,6 +123,7 @@ impl Face {
     }
 
     /// The unit normal towards its front at a position on it.
+    #[inline]
     pub(crate) fn normal(self, view: &View<'_>, position: DVec3) -> DVec3 {
         let of_plane =
             |plane: PlaneIndex| DVec3::from_array(view.planes[plane.index()].normal) * plane.sign();
@@ -149,6 +153,7 @@ impl Face {
     }
 
     /// Whether it lies on a sphere.
+    #[inline]
     pub(crate) fn is_round(self, view: &View<'_>) -> bool {
         match self.item.kind() {
             Some(Kind::Sphere) => true,
@@ -161,6 +166,7 @@ impl Face {
 
     /// By how much a step along it turns its `normal`, per unit of the step: 0 on a flat face,
     /// below 0 on a sphere that is seen from within.
+    #[inline]
     pub(crate) fn curvature(self, view: &View<'_>, position: DVec3, normal: DVec3) -> f64 {
         let index = self.item.index();
         let center = match self.item.kind() {

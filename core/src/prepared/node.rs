@@ -32,7 +32,7 @@ impl Child {
     /// An unused place among the children of a node: the root's index, which no child has.
     pub(crate) const NONE: Self = Self::inner(Node::ROOT);
     /// The most items in a leaf.
-    pub(crate) const MOST_ITEMS: usize = 8;
+    pub(super) const MOST_ITEMS: usize = 8;
     /// The limit of items in a hierarchy.
     pub(crate) const ITEM_LIMIT: usize = 1 << 28;
 
@@ -74,7 +74,7 @@ impl Child {
 
 impl Node {
     /// The index of the node that all others descend from.
-    pub(crate) const ROOT: usize = 0;
+    pub(super) const ROOT: usize = 0;
 
     /// A node without children.
     pub(crate) const EMPTY: Self = {

@@ -2,7 +2,7 @@
 
 use std::ops::Range;
 
-use glam::DVec3;
+use glam::{DVec2, DVec3};
 
 use crate::{exact::float::power_of_two_below_inverse, left_out, transfer::Transfer};
 
@@ -125,7 +125,7 @@ impl Item {
     /// No face.
     pub(crate) const NONE: Self = Self(u32::MAX);
     /// How many faces of one kind a scene may have.
-    pub(crate) const LIMIT: usize = 1 << 29;
+    pub(super) const LIMIT: usize = 1 << 29;
 
     /// A face of the given kind.
     pub(crate) fn new(kind: Kind, index: usize) -> Self {
@@ -218,7 +218,7 @@ pub(crate) struct SolidRecord {
     first_leaf: u32,
     leaf_count: u32,
     /// The rank of its first leaf's first face; each leaf has six.
-    pub(crate) rank: u32,
+    pub(super) rank: u32,
 }
 
 impl SolidRecord {
@@ -234,7 +234,7 @@ impl SolidRecord {
     }
 
     /// The run of its nodes.
-    pub(crate) fn nodes(&self) -> Range<usize> {
+    pub(super) fn nodes(&self) -> Range<usize> {
         self.first_node as usize..self.first_node as usize + self.node_count as usize
     }
 
@@ -261,7 +261,7 @@ impl SolidNodeKind {
     pub(crate) const LEAF: Self = Self(3);
 
     /// Whether it is one of the operations.
-    pub(crate) fn is_operation(self) -> bool {
+    pub(super) fn is_operation(self) -> bool {
         matches!(self, Self::UNION | Self::INTERSECTION | Self::DIFFERENCE)
     }
 }
@@ -510,6 +510,26 @@ impl TexturedFace {
 #[repr(transparent)]
 pub(crate) struct Texcoords(pub(crate) [[f64; 2]; 4]);
 
+impl Texcoords {
+    /// Those of a face that was given none. A triangle's corners are the first, the second and the
+    /// last.
+    pub(crate) const DEFAULT: Self = Self([[0.0, 1.0], [1.0, 1.0], [1.0, 0.0], [0.0, 0.0]]);
+
+    /// Beyond this a number has no fraction, so an image that repeats has no place there.
+    const LARGEST: f64 = (1_u64 << 53) as f64;
+
+    /// Makes those of a quadrangle with these at its corners.
+    pub(crate) fn of_quadrangle(corners: [DVec2; 4]) -> Self {
+        let limit = DVec2::splat(Self::LARGEST);
+        Self(corners.map(|corner| corner.clamp(-limit, limit).to_array()))
+    }
+
+    /// Makes those of a triangle with these at its corners.
+    pub(crate) fn of_triangle([a, b, c]: [DVec2; 3]) -> Self {
+        Self::of_quadrangle([a, b, b + (c - a), c])
+    }
+}
+
 /// An image: a run of levels.
 #[derive(Debug, Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
 #[repr(C)]
@@ -539,7 +559,7 @@ impl TextureRecord {
 
 impl LevelRecord {
     /// Whether it has texels, and they are among so many.
-    pub(crate) fn lies_within(&self, texel_count: usize) -> bool {
+    pub(super) fn lies_within(&self, texel_count: usize) -> bool {
         let count = u64::from(self.width) * u64::from(self.height);
         let end = self.offset.checked_add(count);
         count > 0 && end.is_some_and(|end| end <= texel_count as u64)

@@ -6,8 +6,8 @@ use crate::sample::{FEWEST_FOR_ERROR, RUNS};
 
 /// The samples that a pixel has received.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Pixel {
-    /// Of each run of samples.
+pub(super) struct Pixel {
+    /// The sum of each run of samples.
     sums: [DVec3; RUNS as usize],
     /// The sum of the samples' squares.
     squares: DVec3,
@@ -17,8 +17,8 @@ pub(crate) struct Pixel {
     /// How far apart the first samples of the pixel and its neighbours lie, once the neighbours
     /// have been looked at.
     contrast: Option<DVec3>,
-    /// The variance by what no sample has met and may hide in the pixel.
-    hidden: DVec3,
+    /// The variance that faces add which no sample has met.
+    unseen: DVec3,
 }
 
 /// The variance of the mean where an edge crosses a pixel is about this times the samples' own
@@ -29,7 +29,7 @@ const EDGE: f64 = 0.65;
 /// square times n^-3. An edge that covers a share c of the pixel, all c as likely, is missed by n
 /// samples with (1 - c)^n, and the mean of c² over these is 2 n^-3; some pixels beside an edge
 /// have none.
-pub(crate) const UNSEEN: f64 = 1.5;
+pub(super) const UNSEEN: f64 = 1.5;
 
 /// What a pixel shows of a contrast that runs evenly through its neighbourhood, as of a shade: a
 /// fourth. What is beyond that is unseen.
@@ -43,14 +43,14 @@ impl Default for Pixel {
             range: [DVec3::INFINITY, DVec3::NEG_INFINITY],
             count: 0,
             contrast: None,
-            hidden: DVec3::ZERO,
+            unseen: DVec3::ZERO,
         }
     }
 }
 
 impl Pixel {
     /// Takes in what the next sample saw: they come in the order of their numbers.
-    pub(crate) fn add(&mut self, color: DVec3) {
+    pub(super) fn add(&mut self, color: DVec3) {
         self.sums[(self.count % RUNS) as usize] += color;
         self.squares += color * color;
         self.range = [self.range[0].min(color), self.range[1].max(color)];
@@ -58,33 +58,33 @@ impl Pixel {
     }
 
     /// How many samples there are.
-    pub(crate) fn count(&self) -> u32 {
+    pub(super) fn count(&self) -> u32 {
         self.count
     }
 
     /// The mean of all samples.
-    pub(crate) fn mean(&self) -> DVec3 {
+    pub(super) fn mean(&self) -> DVec3 {
         let [a, b, c, d] = self.sums;
         ((a + b) + (c + d)) / f64::from(self.count)
     }
 
     /// The least and the largest sample, channel by channel.
-    pub(crate) fn range(&self) -> [DVec3; 2] {
+    pub(super) fn range(&self) -> [DVec3; 2] {
         self.range
     }
 
     /// Notes how far apart the first samples of the pixel and its neighbours lie.
-    pub(crate) fn set_contrast(&mut self, contrast: DVec3) {
+    pub(super) fn set_contrast(&mut self, contrast: DVec3) {
         self.contrast = Some(contrast);
     }
 
-    /// Notes by how much what no sample has met may change the mean: the expected square.
-    pub(crate) fn set_hidden(&mut self, variance: DVec3) {
-        self.hidden = variance;
+    /// Notes the variance that faces add to the mean which no sample has met.
+    pub(super) fn set_unseen(&mut self, variance: DVec3) {
+        self.unseen = variance;
     }
 
     /// The estimated variance of the mean, per channel; `None` with too few samples.
-    pub(crate) fn variance(&self) -> Option<DVec3> {
+    pub(super) fn variance(&self) -> Option<DVec3> {
         (self.count >= FEWEST_FOR_ERROR).then(|| match self.contrast {
             Some(contrast) => self.careful_variance(contrast),
             None => self.variance_of_runs(),
@@ -92,7 +92,7 @@ impl Pixel {
     }
 
     /// Whether the estimated standard error is below `error` in each channel.
-    pub(crate) fn is_below(&self, error: f64) -> bool {
+    pub(super) fn is_below(&self, error: f64) -> bool {
         self.variance().is_some_and(|variance| variance.max_element() < error * error)
     }
 
@@ -118,9 +118,9 @@ impl Pixel {
         let mean = self.mean();
         let variance = (self.squares / n - mean * mean).max(DVec3::ZERO) * (n / (n - 1.0));
         let of_edge = variance * (EDGE / (n * n.sqrt()));
-        let unseen = (contrast - EVEN * (self.range[1] - self.range[0])).max(DVec3::ZERO);
-        let of_unseen = unseen * unseen * (UNSEEN / (n * n * n));
-        (self.variance_of_runs() + of_edge) / 2.0 + of_unseen + self.hidden
+        let missed = (contrast - EVEN * (self.range[1] - self.range[0])).max(DVec3::ZERO);
+        let of_contrast = missed * missed * (UNSEEN / (n * n * n));
+        (self.variance_of_runs() + of_edge) / 2.0 + of_contrast + self.unseen
     }
 }
 

@@ -33,7 +33,7 @@ pub(super) struct Sampler<'a> {
 }
 
 impl<'a> Sampler<'a> {
-    pub(super) fn new(
+    pub(crate) fn new(
         view: &'a View<'a>,
         quality: &'a Quality,
         isa: Isa,
@@ -94,10 +94,10 @@ impl<'a> Sampler<'a> {
             pixels[pixel as usize].set_contrast(contrast);
         }
         let quality = self.quality;
-        let beams = UnseenSearch::new(self.view, area.frame(), quality.flat, error);
-        let mut hidden = match beams {
-            Some(beams) => self.find_hidden(beams, area, wide, &mut pixels, &hits)?,
-            None => Hidden::default(),
+        let search = UnseenSearch::new(self.view, area.frame(), quality.flat, error);
+        let mut watch = match search {
+            Some(search) => self.find_unseen(search, area, wide, &mut pixels, &hits)?,
+            None => UnseenWatch::default(),
         };
         drop(hits);
         let is_open = |pixels: &[Pixel], pixel: u32| !pixels[pixel as usize].is_below(error);
@@ -107,27 +107,28 @@ impl<'a> Sampler<'a> {
         while !open.is_empty() && count < most {
             count = most.min(2 * count);
             self.extend(wide, &mut pixels, &open, count, None)?;
-            hidden.pass(wide, &mut pixels, quality.seed);
+            watch.note_samples(wide, &mut pixels, quality.seed);
             open.retain(|&pixel| is_open(&pixels, pixel));
         }
         self.tally.capped += open.len() as u64;
         ControlFlow::Continue(inner.iter().map(|&pixel| pixels[pixel as usize]).collect())
     }
 
-    /// Finds what may hide in the pixels of `area`, from the first samples of `wide`.
-    fn find_hidden(
+    /// Finds the faces in the pixels of `area` that none of the first samples has met; `hits` has
+    /// what the samples of `wide` met.
+    fn find_unseen(
         &mut self,
-        mut beams: UnseenSearch<'a>,
+        mut search: UnseenSearch<'a>,
         area: Area,
         wide: Area,
         pixels: &mut [Pixel],
         hits: &[Hit],
-    ) -> ControlFlow<(), Hidden<'a>> {
+    ) -> ControlFlow<(), UnseenWatch<'a>> {
         let seed = self.quality.seed;
         let mut found = Vec::new();
-        for part in area.blocks(32) {
+        for block in area.blocks(32) {
             (self.on_progress)()?;
-            let look = |x: u32, y: u32| {
+            let first_samples = |x: u32, y: u32| {
                 let pixel = wide.index_of(x, y);
                 let first = pixel as usize * FEWEST_FOR_ERROR as usize;
                 FirstSamples {
@@ -136,14 +137,14 @@ impl<'a> Sampler<'a> {
                     mean: pixels[pixel as usize].mean(),
                 }
             };
-            beams.search(part, &look, &mut |x, y, unseen| {
+            search.search(block, &first_samples, &mut |x, y, unseen| {
                 found.push((wide.index_of(x, y), FEWEST_FOR_ERROR, unseen));
             });
         }
         for (pixel, count, unseen) in &found {
-            pixels[*pixel as usize].set_hidden(unseen.variance(*count));
+            pixels[*pixel as usize].set_unseen(unseen.variance(*count));
         }
-        ControlFlow::Continue(Hidden { beams: Some(beams), found })
+        ControlFlow::Continue(UnseenWatch { search: Some(search), found })
     }
 
     /// Brings the `chosen` ones among the pixels of `area`, which all have as many samples, to
@@ -187,29 +188,30 @@ impl<'a> Sampler<'a> {
     }
 }
 
-/// What may hide in pixels.
+/// Faces in pixels that no sample has met, watched until one does.
 #[derive(Default)]
-struct Hidden<'a> {
-    beams: Option<UnseenSearch<'a>>,
-    /// Pixels, by how many of their samples they are up to, and what none of those passed.
+struct UnseenWatch<'a> {
+    search: Option<UnseenSearch<'a>>,
+    /// Pixels of the area, how many of their samples are noted, and the faces that none of those
+    /// has met or passed.
     found: Vec<(u32, u32, UnseenFaces)>,
 }
 
-impl Hidden<'_> {
-    /// Notes where the latest samples of the pixels of `area` have passed.
-    fn pass(&mut self, area: Area, pixels: &mut [Pixel], seed: u64) {
-        let Some(beams) = &self.beams else { return };
-        for (index, had, unseen) in &mut self.found {
+impl UnseenWatch<'_> {
+    /// Notes where the latest samples of the pixels of `area` lie.
+    fn note_samples(&mut self, area: Area, pixels: &mut [Pixel], seed: u64) {
+        let Some(search) = &self.search else { return };
+        for (index, noted, unseen) in &mut self.found {
             let pixel = &mut pixels[*index as usize];
             let (x, y) = area.pixel_at(*index);
             let samples = Samples::new(pixel.count(), seed, x, y);
-            if *had == pixel.count() || unseen.is_empty() {
+            if *noted == pixel.count() || unseen.is_empty() {
                 continue;
             }
-            let places = (*had..pixel.count()).map(|number| samples.sample(number).place(x, y));
-            beams.note_samples(unseen, places, pixel.count());
-            *had = pixel.count();
-            pixel.set_hidden(unseen.variance(*had));
+            let places = (*noted..pixel.count()).map(|number| samples.sample(number).place(x, y));
+            search.note_samples(unseen, places, pixel.count());
+            *noted = pixel.count();
+            pixel.set_unseen(unseen.variance(*noted));
         }
     }
 }

@@ -89,6 +89,20 @@ struct Branch {
     depth: u32,
 }
 
+impl Branch {
+    /// The branch of a number that leaves the place that this one has met, and that counts
+    /// `factor` times as much.
+    #[inline(always)]
+    fn next(self, factor: f64, number: u64) -> Self {
+        Self {
+            sample: self.sample,
+            weight: self.weight * factor,
+            node: node_after(self.node, number),
+            depth: self.depth + 1,
+        }
+    }
+}
+
 impl RayQueue {
     fn clear(&mut self) {
         self.rays.clear();
@@ -100,7 +114,9 @@ impl RayQueue {
     fn push(&mut self, ray: Ray, branch: Branch, differential: Option<RayDifferential>) {
         self.rays.push(ray);
         self.branches.push(branch);
-        self.differentials.extend(differential);
+        if let Some(differential) = differential {
+            self.differentials.push(differential);
+        }
     }
 }
 
@@ -134,33 +150,31 @@ impl Wavefront {
         let screen = [camera.top_left, camera.right, camera.down].map(DVec3::from_array);
         self.queue.clear();
         self.samples.clear();
-        for (number, CameraSample { x, y, sample, width }) in samples.enumerate() {
+        let (all_samples, differentials) = (&mut self.samples, &mut self.queue.differentials);
+        self.queue.rays.extend(samples.map(|CameraSample { x, y, sample, width }| {
             if gathers {
-                self.samples.push(sample);
+                all_samples.push(sample);
             }
             let [across, down] = sample.position();
             let u = (f64::from(x) + across) / f64::from(frame.width());
             let v = (f64::from(y) + down) / f64::from(frame.height());
             let direction = screen[0] + u * screen[1] + v * screen[2];
-            let differential = has_textures.then(|| {
+            if has_textures {
                 let steps = [(1, frame.width()), (2, frame.height())]
                     .map(|(side, count)| screen[side] * (width / f64::from(count)));
-                RayDifferential::of_camera(direction, steps)
-            });
-            let ray = Ray {
+                differentials.push(RayDifferential::of_camera(direction, steps));
+            }
+            Ray {
                 origin: DVec3::from_array(camera.eye),
                 direction: direction / direction.length(),
                 reach: f64::INFINITY,
                 leaving: Surface::NONE,
                 after: Ray::NOTHING_AHEAD,
-            };
-            self.queue.push(
-                ray,
-                Branch { sample: number, weight: 1.0, node: 0, depth: 0 },
-                differential,
-            );
-        }
+            }
+        }));
         let count = self.queue.rays.len();
+        let branch = |sample| Branch { sample, weight: 1.0, node: 0, depth: 0 };
+        self.queue.branches.extend((0..count).map(branch));
         self.colors.clear();
         self.colors.resize(count, DVec3::ZERO);
         self.untraced.clear();
@@ -272,36 +286,18 @@ impl Wavefront {
         differential: Option<RayDifferential>,
         cutoff: f64,
     ) {
-        let Branch { sample, weight, node, depth } = branch;
         let (reflect, alpha, index) = (at.material.reflect, at.material.alpha, at.material.refract);
-        let mut follow = |direction: DVec3,
-                          after: u32,
-                          weight: f64,
-                          number: u64,
-                          differential: Option<RayDifferential>| {
-            if weight < cutoff || depth == DEEPEST {
-                self.untraced[sample] += weight;
-                return;
-            }
-            let (origin, leaving) = (at.position, at.surface);
-            let ray = Ray { origin, direction, reach: f64::INFINITY, leaving, after };
-            let node = node_after(node, number);
-            self.next_queue.push(
-                ray,
-                Branch { sample, weight, node, depth: depth + 1 },
-                differential,
-            );
-        };
         let cosine = -at.normal.dot(ray.direction);
         let mirrored = mirror(ray.direction, at.normal, cosine);
         let curvature = if differential.is_some() { at.curvature(view) } else { 0.0 };
-        let mirrored_differential = differential
-            .map(|differential| differential.mirror(ray.direction, at.normal, curvature));
+        let mirrored_differential =
+            differential.map(|it| it.mirror(ray.direction, at.normal, curvature));
+        let reflected = at.leave(mirrored, Ray::NOTHING_AHEAD);
         if reflect > 0.0 && !left_out::MIRROR {
-            follow(mirrored, Ray::NOTHING_AHEAD, weight * reflect, 1, mirrored_differential);
+            self.follow(reflected, branch.next(reflect, 1), mirrored_differential, cutoff);
         }
         if reflect < 1.0 && alpha < 1.0 && !left_out::TRANSPARENCY {
-            let weight = weight * ((1.0 - reflect) * (1.0 - alpha));
+            let transmitted = branch.next((1.0 - reflect) * (1.0 - alpha), 2);
             let ratio = if at.is_front { index } else { 1.0 / index };
             let is_straight = left_out::REFRACTION || index == 0.0 || index == 1.0;
             let bent = if is_straight {
@@ -311,15 +307,31 @@ impl Wavefront {
             };
             match bent {
                 Some(direction) => {
-                    let refract = |differential: RayDifferential| {
-                        differential.refract(ray.direction, at.normal, curvature, ratio)
+                    let refract = |it: RayDifferential| {
+                        it.refract(ray.direction, at.normal, curvature, ratio)
                     };
                     let bent = if is_straight { differential } else { differential.map(refract) };
-                    follow(direction, at.rank, weight, 2, bent);
+                    self.follow(at.leave(direction, at.rank), transmitted, bent, cutoff);
                 }
                 // Total reflection.
-                None => follow(mirrored, Ray::NOTHING_AHEAD, weight, 2, mirrored_differential),
+                None => self.follow(reflected, transmitted, mirrored_differential, cutoff),
             }
+        }
+    }
+
+    /// Queues a ray, unless its branch counts too little or lies too deep.
+    #[inline(always)]
+    fn follow(
+        &mut self,
+        ray: Ray,
+        branch: Branch,
+        differential: Option<RayDifferential>,
+        cutoff: f64,
+    ) {
+        if branch.weight < cutoff || branch.depth > DEEPEST {
+            self.untraced[branch.sample] += branch.weight;
+        } else {
+            self.next_queue.push(ray, branch, differential);
         }
     }
 
@@ -346,7 +358,7 @@ impl Wavefront {
     fn light(&mut self, view: &View<'_>, index: usize, isa: Isa) -> u64 {
         let light = &view.lights[index];
         let [position, intensity] = [light.position, light.intensity].map(DVec3::from_array);
-        let touches = view.coincident_surfaces(light);
+        let on_light = view.coincident_surfaces(light);
         self.shadow_rays.clear();
         self.arrivals.clear();
         for (k, point) in self.points.iter().enumerate() {
@@ -354,7 +366,7 @@ impl Wavefront {
             let height = point.normal.dot(to_light);
             // Where the light is on the surface the height is rounding, but the distance may be
             // as small.
-            if height > 0.0 && !touches.contains(&point.surface) {
+            if height > 0.0 && !on_light.contains(&point.surface) {
                 let distance = to_light.length();
                 self.arrivals.push((k, intensity * (height / (distance * distance * distance))));
                 self.shadow_rays.push(Ray {

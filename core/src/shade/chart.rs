@@ -27,7 +27,7 @@ pub(super) struct Chart {
 impl Chart {
     /// Makes the chart of a face with three corners or four, counter-clockwise seen from where
     /// `normal` points.
-    pub(super) fn new(corners: &[DVec3], normal: DVec3) -> Self {
+    pub(crate) fn new(corners: &[DVec3], normal: DVec3) -> Self {
         let from_first = |k: usize| corners[k] - corners[0];
         let extent =
             (1..corners.len()).map(|k| from_first(k).abs().max_element()).fold(0.0, f64::max);
@@ -99,24 +99,6 @@ fn cross(a: DVec2, b: DVec2) -> f64 {
 }
 
 impl Texcoords {
-    /// Those of a face that was given none. A triangle's corners are the first, the second and the
-    /// last.
-    pub(crate) const DEFAULT: Self = Self([[0.0, 1.0], [1.0, 1.0], [1.0, 0.0], [0.0, 0.0]]);
-
-    /// Beyond this a number has no fraction, so an image that repeats has no place there.
-    const LARGEST: f64 = (1_u64 << 53) as f64;
-
-    /// Makes those of a quadrangle with these at its corners.
-    pub(crate) fn of_quadrangle(corners: [DVec2; 4]) -> Self {
-        let limit = DVec2::splat(Self::LARGEST);
-        Self(corners.map(|corner| corner.clamp(-limit, limit).to_array()))
-    }
-
-    /// Makes those of a triangle with these at its corners.
-    pub(crate) fn of_triangle([a, b, c]: [DVec2; 3]) -> Self {
-        Self::of_quadrangle([a, b, b + (c - a), c])
-    }
-
     /// The texture coordinates at a place.
     pub(super) fn at(&self, place: DVec2) -> DVec2 {
         let [a, b, c, d] = self.0.map(DVec2::from_array);

@@ -19,7 +19,7 @@ pub(crate) struct Interaction<'a> {
     /// The distance from the ray's origin, in units of its direction.
     pub(crate) t: f64,
     pub(crate) position: DVec3,
-    pub(crate) face: Face,
+    pub(super) face: Face,
     pub(crate) rank: u32,
     pub(crate) surface: Surface,
     pub(crate) material: &'a MaterialRecord,
@@ -76,6 +76,13 @@ impl<'a> Interaction<'a> {
         }
     }
 
+    /// A ray that leaves the surface here; `after` is as in [`Ray`].
+    #[inline(always)]
+    pub(crate) fn leave(&self, direction: DVec3, after: u32) -> Ray {
+        let (origin, leaving) = (self.position, self.surface);
+        Ray { origin, direction, reach: f64::INFINITY, leaving, after }
+    }
+
     /// By how much a step along the face turns the normal, per unit of the step.
     pub(crate) fn curvature(&self, view: &View<'_>) -> f64 {
         self.face.curvature(view, self.position, self.normal)
@@ -91,7 +98,7 @@ pub(crate) struct Point {
     /// What the surface's own light counts in the sample.
     pub(crate) weight: f64,
     pub(crate) position: DVec3,
-    /// Of length 1, towards the side that is seen.
+    /// The unit normal towards the side that is seen.
     pub(crate) normal: DVec3,
     pub(crate) surface: Surface,
     pub(crate) color: DVec3,

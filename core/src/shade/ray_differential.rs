@@ -5,13 +5,15 @@
 
 use glam::DVec3;
 
+use super::optics::squared_cosine_behind;
+
 /// The derivatives of a ray by its sample's place on the screen, first across and then down. A step
 /// of 1 is the width of the square that belongs to one sample.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct RayDifferential {
     /// The derivatives of the ray's origin, in the block's units. After
     /// [`RayDifferential::transfer`] they lie in the surface.
-    pub(crate) origin: [DVec3; 2],
+    pub(super) origin: [DVec3; 2],
     /// The derivatives of the ray's unit direction.
     direction: [DVec3; 2],
 }
@@ -22,9 +24,9 @@ pub(crate) struct RayDifferential {
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct SurfaceFootprint {
     /// The sides, in the block's units.
-    pub(crate) sides: [DVec3; 2],
+    pub(super) sides: [DVec3; 2],
     /// The changes of the denominator by s and by t: they draw the far end out.
-    pub(crate) tapers: [f64; 2],
+    pub(super) tapers: [f64; 2],
 }
 
 impl SurfaceFootprint {
@@ -75,7 +77,7 @@ impl RayDifferential {
         ratio: f64,
     ) -> Self {
         let cosine = -direction.dot(normal);
-        let cosine_behind = (1.0 - ratio * ratio * ((1.0 - cosine) * (1.0 + cosine))).sqrt();
+        let cosine_behind = squared_cosine_behind(cosine, ratio).sqrt();
         let slope = ratio - ratio * ratio * cosine / cosine_behind;
         self.turn(direction, normal, curvature, [ratio, ratio * cosine - cosine_behind, slope])
     }

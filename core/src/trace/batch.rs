@@ -23,7 +23,7 @@ use crate::{
 /// Finds what each ray meets first.
 pub(crate) fn trace(view: &View<'_>, isa: Isa, rays: &[Ray], hits: &mut Vec<Hit>) {
     hits.clear();
-    run_with_kernel(isa, &mut Trace { view, rays, hits });
+    run_with_kernel(isa, view, &mut Trace { rays, hits });
 }
 
 /// Finds which share of its light each ray, running to `light`, lets through: 0..=1.
@@ -35,24 +35,22 @@ pub(crate) fn trace_shadows(
     shares: &mut Vec<f64>,
 ) {
     shares.clear();
-    let touches = view.coincident_surfaces(light);
+    let ending_on = view.coincident_surfaces(light);
     if view.header.features.has_clear_shadows() {
-        run_with_kernel(isa, &mut ClearShadows { view, rays, touches, shares });
+        run_with_kernel(isa, view, &mut ClearShadows { rays, ending_on, shares });
     } else {
-        run_with_kernel(isa, &mut Shadows { view, rays, touches, shares });
+        run_with_kernel(isa, view, &mut Shadows { rays, ending_on, shares });
     }
 }
 
 struct Trace<'a> {
-    view: &'a View<'a>,
     rays: &'a [Ray],
     hits: &'a mut Vec<Hit>,
 }
 
-impl KernelWork for Trace<'_> {
+impl KernelWork<View<'_>> for Trace<'_> {
     #[inline(always)]
-    fn run(&mut self, kernel: impl BoxKernel) {
-        let view = self.view;
+    fn run(&mut self, view: &View<'_>, kernel: impl BoxKernel) {
         let (mut scratch, mut stack) = (Scratch::default(), Stack::default());
         for ray in self.rays {
             let mut nearest = Nearest::new(ray);
@@ -67,22 +65,20 @@ impl KernelWork for Trace<'_> {
 
 /// Nothing lets light through: the first face decides.
 struct Shadows<'a> {
-    view: &'a View<'a>,
     rays: &'a [Ray],
-    touches: &'a [Surface],
+    ending_on: &'a [Surface],
     shares: &'a mut Vec<f64>,
 }
 
-impl KernelWork for Shadows<'_> {
+impl KernelWork<View<'_>> for Shadows<'_> {
     #[inline(always)]
-    fn run(&mut self, kernel: impl BoxKernel) {
-        let view = self.view;
+    fn run(&mut self, view: &View<'_>, kernel: impl BoxKernel) {
         let (mut scratch, mut stack) = (Scratch::default(), Stack::default());
         for ray in self.rays {
             let shear = Shear::new(ray.origin, ray.direction);
             let mut is_blocked = false;
             visit(kernel, view, ray, &mut stack, |item| {
-                between(view, ray, &shear, self.touches, item, &mut scratch, |_, _| {
+                between(view, ray, &shear, self.ending_on, item, &mut scratch, |_, _| {
                     is_blocked = true;
                 });
                 if is_blocked { Step::Enough } else { Step::On(ray.reach) }
@@ -94,16 +90,14 @@ impl KernelWork for Shadows<'_> {
 
 /// Every face counts.
 struct ClearShadows<'a> {
-    view: &'a View<'a>,
     rays: &'a [Ray],
-    touches: &'a [Surface],
+    ending_on: &'a [Surface],
     shares: &'a mut Vec<f64>,
 }
 
-impl KernelWork for ClearShadows<'_> {
+impl KernelWork<View<'_>> for ClearShadows<'_> {
     #[inline(always)]
-    fn run(&mut self, kernel: impl BoxKernel) {
-        let view = self.view;
+    fn run(&mut self, view: &View<'_>, kernel: impl BoxKernel) {
         let (mut scratch, mut stack) = (Scratch::default(), Stack::default());
         let mut crossed: Vec<(u32, f64)> = Vec::new();
         for ray in self.rays {
@@ -111,7 +105,7 @@ impl KernelWork for ClearShadows<'_> {
             crossed.clear();
             let mut is_blocked = false;
             visit(kernel, view, ray, &mut stack, |item| {
-                between(view, ray, &shear, self.touches, item, &mut scratch, |rank, part| {
+                between(view, ray, &shear, self.ending_on, item, &mut scratch, |rank, part| {
                     let share = Face { item, part }.material(view).transmittance();
                     is_blocked |= share == 0.0;
                     crossed.push((rank, share));

@@ -40,7 +40,7 @@ const NEAR: f64 = 2.0 * f32::EPSILON as f64;
 
 impl BoxRay {
     #[inline(always)]
-    pub(super) fn new(origin: DVec3, direction: DVec3, reach: f64, frame: &Frame) -> Self {
+    pub(crate) fn new(origin: DVec3, direction: DVec3, reach: f64, frame: &Frame) -> Self {
         let mut relative = (origin - DVec3::from_array(frame.origin)) * frame.scale;
         // Seen from afar the scene is a speck in f32: start where it begins. All of it lies
         // within sqrt(3) of the frame's origin.
@@ -143,6 +143,9 @@ impl BoxKernel for ScalarBoxes {
 }
 
 /// Work that is compiled once for each instruction set.
-pub(super) trait KernelWork {
-    fn run(&mut self, kernel: impl BoxKernel);
+///
+/// What it reads all the time is an argument of its own: the compiler knows of an argument that
+/// nothing else changes it, and keeps what it has loaded.
+pub(super) trait KernelWork<Input> {
+    fn run(&mut self, input: &Input, kernel: impl BoxKernel);
 }

@@ -15,7 +15,7 @@ use crate::prepared::node::Node;
 pub(super) struct Sse2Boxes(());
 
 impl Sse2Boxes {
-    pub(super) fn new() -> Self {
+    pub(crate) fn new() -> Self {
         Self(())
     }
 }
@@ -62,13 +62,17 @@ impl Avx2Boxes {
     }
 
     /// Does work that is compiled for AVX2 together with the kernel.
-    pub(super) fn run(self, work: &mut impl KernelWork) {
+    pub(super) fn run<Input>(self, input: &Input, work: &mut impl KernelWork<Input>) {
         #[target_feature(enable = "avx2")]
-        fn run_compiled_for_avx2(kernel: Avx2Boxes, work: &mut impl KernelWork) {
-            work.run(kernel);
+        fn run_compiled_for_avx2<Input>(
+            kernel: Avx2Boxes,
+            input: &Input,
+            work: &mut impl KernelWork<Input>,
+        ) {
+            work.run(input, kernel);
         }
         // SAFETY: a value of this type says that the CPU has AVX2.
-        unsafe { run_compiled_for_avx2(self, work) }
+        unsafe { run_compiled_for_avx2(self, input, work) }
     }
 }
 

@@ -24,7 +24,7 @@ pub(super) struct Nearest<'a> {
 
 impl<'a> Nearest<'a> {
     #[inline(always)]
-    pub(super) fn new(ray: &'a Ray) -> Self {
+    pub(crate) fn new(ray: &'a Ray) -> Self {
         let shear = Shear::new(ray.origin, ray.direction);
         Self { ray, shear, hit: Hit::none(ray.reach) }
     }
@@ -130,13 +130,13 @@ pub(super) fn meet_solid(
 }
 
 /// Calls `cross` with the rank and the part of every crossing of a face strictly between the
-/// ray's start and its end, which is a light that the surfaces `touches` contain.
+/// ray's start and its end, which is a light that the surfaces `ending_on` contain.
 #[inline(always)]
 pub(super) fn between(
     view: &View<'_>,
     ray: &Ray,
     shear: &Shear,
-    touches: &[Surface],
+    ending_on: &[Surface],
     item: Item,
     scratch: &mut Scratch,
     mut cross: impl FnMut(u32, Part),
@@ -145,7 +145,7 @@ pub(super) fn between(
     match item.kind() {
         Some(Kind::Solid) => {
             let solid = &view.solids[index];
-            scratch.cross(view, solid, ray, touches);
+            scratch.cross(view, solid, ray, ending_on);
             for crossing in &scratch.crossings {
                 if crossing.t > 0.0 && crossing.t < ray.reach {
                     cross(crossing.part.rank(solid), crossing.part);
@@ -157,7 +157,7 @@ pub(super) fn between(
             let center = DVec3::from_array(sphere.center);
             let surface = Surface(sphere.surface);
             let is_inner = |&t: &f64| t > 0.0 && t < ray.reach;
-            let ends = match (ray.leaving == surface, touches.contains(&surface)) {
+            let ends = match (ray.leaving == surface, ending_on.contains(&surface)) {
                 (true, true) => return, // A chord: nothing between its ends.
                 (true, false) => [hit_sphere_again(ray, center), f64::INFINITY],
                 (false, true) => {
@@ -173,7 +173,7 @@ pub(super) fn between(
             }
         }
         _ => {
-            if !touches.is_empty() && touches.contains(&Face::whole(item).surface(view)) {
+            if !ending_on.is_empty() && ending_on.contains(&Face::whole(item).surface(view)) {
                 return;
             }
             if let Some((t, rank, _)) = meet(view, ray, shear, item, scratch)

@@ -13,14 +13,14 @@ use super::{
 ///
 /// Source: Shimrat, "Algorithm 112: Position of point relative to polygon" (1962).
 #[inline(always)]
-pub(crate) fn is_inside(corners: &[Projected; 4]) -> bool {
+pub(super) fn is_inside(corners: &[Projected; 4]) -> bool {
     is_inside_in_doubt(corners, &mut false)
 }
 
 /// The same; sets `is_in_doubt` where rounded products do not suffice and their lost digits are
 /// asked.
 #[inline(always)]
-pub(crate) fn is_inside_in_doubt(corners: &[Projected; 4], is_in_doubt: &mut bool) -> bool {
+pub(super) fn is_inside_in_doubt(corners: &[Projected; 4], is_in_doubt: &mut bool) -> bool {
     let mut inside = false;
     for (k, a) in corners.iter().enumerate() {
         let b = &corners[(k + 1) % 4];
@@ -43,7 +43,7 @@ pub(crate) fn is_inside_in_doubt(corners: &[Projected; 4], is_in_doubt: &mut boo
 /// The distance at which the ray crosses the quadrangle in the plane through `point` with the
 /// unit `normal`, in units of its direction; `None` where it passes by.
 #[inline(always)]
-pub(crate) fn hit_quadrangle(
+pub(super) fn hit_quadrangle(
     ray: &Ray,
     corners: &[Projected; 4],
     point: DVec3,
@@ -59,7 +59,7 @@ pub(crate) fn hit_quadrangle(
 /// The distance to a plane; `None` for a ray that as good as runs along it, for which the division
 /// would give any place in the plane.
 #[inline(always)]
-pub(crate) fn hit_plane(ray: &Ray, point: DVec3, normal: DVec3) -> Option<f64> {
+pub(super) fn hit_plane(ray: &Ray, point: DVec3, normal: DVec3) -> Option<f64> {
     let (distance, along) = toward_plane(ray, point, normal);
     (along.abs() > EDGE_ON).then(|| distance / along)
 }
@@ -67,7 +67,7 @@ pub(crate) fn hit_plane(ray: &Ray, point: DVec3, normal: DVec3) -> Option<f64> {
 /// How far a plane is from the ray's start, and how fast the ray goes there, both along its
 /// normal: the same for all faces in the plane.
 #[inline(always)]
-pub(crate) fn toward_plane(ray: &Ray, point: DVec3, normal: DVec3) -> (f64, f64) {
+pub(super) fn toward_plane(ray: &Ray, point: DVec3, normal: DVec3) -> (f64, f64) {
     (normal.dot(point - ray.origin), normal.dot(ray.direction))
 }
 

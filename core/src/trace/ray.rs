@@ -44,7 +44,7 @@ pub(crate) struct Hit {
 
 impl Hit {
     /// Nothing, up to `reach`.
-    pub(crate) fn none(reach: f64) -> Self {
+    pub(super) fn none(reach: f64) -> Self {
         Self { t: reach, rank: u32::MAX, face: Face::NONE }
     }
 
@@ -59,7 +59,7 @@ impl Hit {
 /// Source: Woop, Benthin & Wald, "Watertight Ray/Triangle Intersection" (2013): the direction's
 /// largest component becomes the depth axis and the other two are sheared along it.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Shear {
+pub(super) struct Shear {
     axes: [usize; 3],
     origin: [f64; 3],
     slopes: [f64; 3],
@@ -67,11 +67,11 @@ pub(crate) struct Shear {
 
 /// A vertex as a ray sees it.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Projected {
-    pub(crate) x: f64,
-    pub(crate) y: f64,
+pub(super) struct Projected {
+    pub(super) x: f64,
+    pub(super) y: f64,
     /// The distance along the ray, in units of its direction.
-    pub(crate) z: f64,
+    pub(super) z: f64,
 }
 
 impl Shear {
@@ -97,7 +97,7 @@ impl Shear {
 
     /// The same for one vertex whoever asks, so that faces that share it agree on it.
     #[inline(always)]
-    pub(crate) fn project(&self, vertex: &[f64; 3]) -> Projected {
+    pub(super) fn project(&self, vertex: &[f64; 3]) -> Projected {
         let [x, y, z] = self.axes;
         let depth = vertex[z] - self.origin[2];
         Projected {
@@ -107,10 +107,10 @@ impl Shear {
         }
     }
 
-    /// Of each vertex. A loop, for the closure of a `map` is called where a kernel is compiled for
+    /// Projects every vertex. This is a loop, since the closure of a `map` is called where a kernel is compiled for
     /// an instruction set.
     #[inline(always)]
-    pub(crate) fn project_all<const N: usize>(&self, vertices: [&[f64; 3]; N]) -> [Projected; N] {
+    pub(super) fn project_all<const N: usize>(&self, vertices: [&[f64; 3]; N]) -> [Projected; N] {
         let mut projected = [Projected { x: 0.0, y: 0.0, z: 0.0 }; N];
         for (projected, vertex) in projected.iter_mut().zip(vertices) {
             *projected = self.project(vertex);
@@ -126,12 +126,12 @@ impl Shear {
 /// than another if the exact one is. Swapping `a` and `b` flips the sign and nothing else, so
 /// faces that share an edge never both let a ray through or both stop it.
 #[inline(always)]
-pub(crate) fn edge(a: &Projected, b: &Projected) -> f64 {
+pub(super) fn edge(a: &Projected, b: &Projected) -> f64 {
     a.x * b.y - a.y * b.x
 }
 
 /// [`edge`] with the digits that the products lost: right to an ulp or two.
-pub(crate) fn exact_edge(a: &Projected, b: &Projected) -> f64 {
+pub(super) fn exact_edge(a: &Projected, b: &Projected) -> f64 {
     let (left, left_error) = exact_product(a.x, b.y);
     let (right, right_error) = exact_product(a.y, b.x);
     (left - right) + (left_error - right_error)
@@ -144,7 +144,7 @@ pub(crate) fn exact_edge(a: &Projected, b: &Projected) -> f64 {
 ///
 /// Source: Edelsbrunner & Mücke, "Simulation of Simplicity" (1990).
 #[cold]
-pub(crate) fn side(a: &Projected, b: &Projected) -> i32 {
+pub(super) fn side(a: &Projected, b: &Projected) -> i32 {
     let (left, left_error) = exact_product(a.x, b.y);
     let (right, right_error) = exact_product(a.y, b.x);
     // Equal products differ by what they lost; after that the nudge decides.

@@ -22,10 +22,10 @@ use crate::prepared::{
 
 /// Where a ray crosses a solid's surface.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(crate) struct Crossing {
+pub(super) struct Crossing {
     /// In units of the ray's direction.
-    pub(crate) t: f64,
-    pub(crate) part: Part,
+    pub(super) t: f64,
+    pub(super) part: Part,
 }
 
 /// Where a ray crosses the boundary of a leaf.
@@ -40,37 +40,39 @@ struct Event {
 
 /// Room to work in, kept from ray to ray.
 #[derive(Debug, Default)]
-pub(crate) struct Scratch {
+pub(super) struct Scratch {
     events: Vec<Event>,
-    /// Of each node: whether the ray is inside it, and how many operands it is inside of (of a
-    /// difference, those that are taken away).
+    /// For each node, whether the ray is inside it.
     inside: Vec<bool>,
+    /// For each node, how many operands the ray is inside of; a difference counts those that are
+    /// taken away.
     counts: Vec<u32>,
-    /// At which crossing each node was last flipped, and whether the ray was inside it before.
+    /// For each node, the crossing at which it was last flipped, and whether the ray was inside it
+    /// before.
     flipped: Vec<u32>,
     before: Vec<bool>,
     crossing: u32,
     /// The face at which each leaf is crossed last.
     faces: Vec<u32>,
     /// The result.
-    pub(crate) crossings: Vec<Crossing>,
+    pub(super) crossings: Vec<Crossing>,
 }
 
 impl Scratch {
     /// Finds where the ray, from its start on, crosses the solid's surface, in order. A surface
-    /// that it leaves is crossed at 0, and one that it ends on (`touches`) at its reach.
-    pub(crate) fn cross(
+    /// that it leaves is crossed at 0, and one that it ends on (`ending_on`) at its reach.
+    pub(super) fn cross(
         &mut self,
         view: &View<'_>,
         solid: &SolidRecord,
         ray: &Ray,
-        touches: &[Surface],
+        ending_on: &[Surface],
     ) {
         self.crossings.clear();
         self.events.clear();
         let leaves = view.solid_leaves(solid);
         for (number, leaf) in (0..).zip(leaves) {
-            push_events(&mut self.events, view, leaf, number, ray, touches);
+            push_events(&mut self.events, view, leaf, number, ray, ending_on);
         }
         if self.events.is_empty() {
             return;
@@ -190,13 +192,13 @@ fn push_events(
     leaf: &LeafRecord,
     number: u32,
     ray: &Ray,
-    touches: &[Surface],
+    ending_on: &[Surface],
 ) {
     // Of coordinates below 1, with the ray's own length on top.
     let doubt_of = |t: f64, cosine: f64| {
         4.0 * f64::EPSILON * (1.0 + ray.origin.abs().max_element() + t.abs()) / cosine.max(1e-12)
     };
-    let ends_on = |surface: Surface| touches.contains(&surface);
+    let ends_on = |surface: Surface| ending_on.contains(&surface);
     if leaf.is_sphere() {
         let center = DVec3::from_array(leaf.center);
         let surface = Surface(leaf.surface);

@@ -11,7 +11,7 @@ use super::ray::Ray;
 /// Intersection", Ray Tracing Gems (2019), ch. 7. The textbook quadratic frays a sphere that is
 /// seen from afar, and loses a camera's height just above a large one.
 #[inline(always)]
-pub(crate) fn hit_sphere(ray: &Ray, center: DVec3, radius: f64) -> Option<[f64; 2]> {
+pub(super) fn hit_sphere(ray: &Ray, center: DVec3, radius: f64) -> Option<[f64; 2]> {
     let to_origin = ray.origin - center;
     let half_b = -to_origin.dot(ray.direction); // The direction has length 1, so a = 1.
 
@@ -32,6 +32,6 @@ pub(crate) fn hit_sphere(ray: &Ray, center: DVec3, radius: f64) -> Option<[f64; 
 /// The distance at which a ray that starts on the sphere crosses it again; <= 0 when it goes out.
 /// The root at the start is known to be 0 and is not computed.
 #[inline(always)]
-pub(crate) fn hit_sphere_again(ray: &Ray, center: DVec3) -> f64 {
+pub(super) fn hit_sphere_again(ray: &Ray, center: DVec3) -> f64 {
     -2.0 * (ray.origin - center).dot(ray.direction)
 }

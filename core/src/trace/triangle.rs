@@ -9,14 +9,14 @@ use super::ray::{Projected, edge, exact_edge, side};
 /// for edges in place of counting both sides. The distance is held between those of the corners,
 /// so a needle that is grazed is never met outside itself.
 #[inline(always)]
-pub(crate) fn hit_triangle(corners: [Projected; 3]) -> Option<f64> {
+pub(super) fn hit_triangle(corners: [Projected; 3]) -> Option<f64> {
     hit_triangle_in_doubt(corners, &mut false)
 }
 
 /// The same; sets `is_in_doubt` where rounded products do not suffice and their lost digits are
 /// asked.
 #[inline(always)]
-pub(crate) fn hit_triangle_in_doubt(
+pub(super) fn hit_triangle_in_doubt(
     [a, b, c]: [Projected; 3],
     is_in_doubt: &mut bool,
 ) -> Option<f64> {
@@ -47,4 +47,4 @@ pub(crate) fn hit_triangle_in_doubt(
 }
 
 /// The sine of the angle between a ray and a face below which the face is as good as seen edge-on.
-pub(crate) const EDGE_ON: f64 = 1.0 / 1_048_576.0;
+pub(super) const EDGE_ON: f64 = 1.0 / 1_048_576.0;

@@ -33,7 +33,7 @@ const MAX_DEPTH: u32 = 64;
 /// A ray of the tree that the eye's ray grows into.
 struct Branch {
     origin: DVec3,
-    /// Of length 1, but for the eye's ray.
+    /// Its length is 1, but for the eye's ray.
     direction: DVec3,
     leaving: Option<Leaving>,
     depth: u32,
