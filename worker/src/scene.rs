@@ -9,7 +9,7 @@ use std::{
 
 use rtfarm_core::prepared::{PreparedError, PreparedScene};
 use rtfarm_proto::wire::{self, farm_client::FarmClient};
-use tonic::{Status, transport::Channel};
+use tonic::{Code, Status, transport::Channel};
 
 use crate::{job::Job, map::Map, pulse::Pulse};
 
@@ -21,6 +21,10 @@ pub enum SceneError {
     /// A file on this machine fails.
     #[error("cannot read the prepared scene: {0}")]
     Io(#[from] io::Error),
+    /// The scene is not there any more, or its coordinator is not: the job may have been cancelled
+    /// since its tiles were leased.
+    #[error("the prepared scene is gone: {0}")]
+    Gone(String),
     /// The coordinator does not send the scene.
     #[error("cannot fetch the prepared scene: {0}")]
     Fetch(String),
@@ -34,7 +38,15 @@ pub enum SceneError {
 
 impl From<Status> for SceneError {
     fn from(status: Status) -> Self {
-        Self::Fetch(status.message().to_owned())
+        let reason = status.message().to_owned();
+        match status.code() {
+            Code::NotFound
+            | Code::Unavailable
+            | Code::DeadlineExceeded
+            | Code::Unknown
+            | Code::Cancelled => Self::Gone(reason),
+            _ => Self::Fetch(reason),
+        }
     }
 }
 
@@ -47,7 +59,10 @@ pub(crate) async fn load(
     pulse: Arc<Pulse>,
 ) -> Result<Arc<Scene>, SceneError> {
     let file = match &job.scene_path {
-        Some(path) => File::open(path)?,
+        Some(path) => File::open(path).map_err(|error| match error.kind() {
+            io::ErrorKind::NotFound => SceneError::Gone(error.to_string()),
+            _ => SceneError::Io(error),
+        })?,
         None => fetch(&job, silence, client, &pulse).await?,
     };
     let opened = tokio::task::spawn_blocking(move || open(&file, &job, &pulse)).await;
@@ -63,7 +78,7 @@ async fn fetch(
     // The file has no name, so that nothing stays behind.
     let mut file = tempfile::tempfile()?;
     let request = wire::FetchRequest { scene_hash: job.scene.0.to_vec().into() };
-    let late = |_| SceneError::Fetch("the coordinator was silent for too long".to_owned());
+    let late = |_| SceneError::Gone("the coordinator was silent for too long".to_owned());
     let fetched = tokio::time::timeout(silence, client.fetch(request));
     let mut chunks = fetched.await.map_err(late)??.into_inner();
     let mut byte_count = 0;

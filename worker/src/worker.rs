@@ -171,8 +171,18 @@ impl Worker {
 
     /// Event: a scene cannot be brought into memory.
     pub(crate) fn on_fetch_failed(&mut self, task: TaskId, error: SceneError, now: Instant) {
-        if self.tasks.on_end(task) {
-            self.leave(Err(error.into()), now);
+        if !self.tasks.on_end(task) {
+            return;
+        }
+        match (&mut self.stage, error) {
+            (Stage::Working(member), SceneError::Gone(reason)) => {
+                tracing::info!(worker = member.id.0, reason, "dropped a lease");
+                if let Some(run) = member.fetching.take() {
+                    member.leases.remove(&run.lease);
+                }
+                self.proceed(now);
+            }
+            (_, error) => self.leave(Err(error.into()), now),
         }
     }
 

@@ -403,6 +403,23 @@ fn an_unusable_scene_ends_the_worker() {
 }
 
 #[test]
+fn a_scene_that_is_gone_costs_its_lease_and_not_the_worker() {
+    let mut bench = Bench::joined(1);
+    bench.answer(is_lease, run(1, 9, 0));
+    let (task, _) = bench.fetches.pop_first().unwrap();
+    let gone = SceneError::Gone("no job has this scene now".to_owned());
+    bench.worker.on_fetch_failed(task, gone, bench.now);
+    bench.absorb();
+    assert_eq!(bench.exit, None);
+    bench.beat();
+    assert!(!bench.has(is_renew), "the lease is dropped");
+    bench.answer(is_lease, run(2, 1, 1));
+    bench.fetch();
+    assert_eq!(bench.render().0, lease(2));
+    assert!(bench.has(is_deliver), "it works on");
+}
+
+#[test]
 fn a_forgotten_worker_stops_everything_and_joins_again() {
     let mut bench = Bench::rendering(1, 9);
     bench.render();
