@@ -3,6 +3,7 @@
 use std::{
     env,
     io::{self, Write},
+    time::Duration,
 };
 
 use anyhow::{Context, anyhow};
@@ -11,6 +12,9 @@ use tokio::net::{TcpListener, lookup_host};
 use tokio_util::sync::CancellationToken;
 
 use crate::{VERSION, args::CoordinatorArgs, failure::Failure, render::private_folder};
+
+/// A client that sends nothing of its scene for this long is given up.
+pub(crate) const UPLOAD_SILENCE: Duration = Duration::from_secs(30);
 
 pub(crate) async fn run(args: CoordinatorArgs, stop: &CancellationToken) -> Result<(), Failure> {
     let listen = &args.listen;
@@ -33,6 +37,7 @@ pub(crate) async fn run(args: CoordinatorArgs, stop: &CancellationToken) -> Resu
     let coordinator = Coordinator::new(Config {
         version: VERSION.to_owned(),
         term: args.lease_seconds,
+        upload_silence: UPLOAD_SILENCE,
         scene_folder: folder.path().to_owned(),
         picture_folder: folder.path().to_owned(),
     });

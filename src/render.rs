@@ -29,6 +29,7 @@ use crate::{
     args::{PictureArgs, RenderArgs},
     children::{Children, Setup},
     console::Console,
+    coordinator::UPLOAD_SILENCE,
     failure::Failure,
     local,
     output::Output,
@@ -233,6 +234,7 @@ async fn render_with_workers(
     let coordinator = Coordinator::new(Config {
         version: VERSION.to_owned(),
         term: args.lease_seconds,
+        upload_silence: UPLOAD_SILENCE,
         scene_folder: folder.path().to_owned(),
         picture_folder: output.folder(),
     });
