@@ -50,6 +50,11 @@ pub(crate) struct SceneArgs {
     /// Make an error of every warning.
     #[arg(long)]
     pub(crate) strict: bool,
+
+    /// Let the scene name files in this folder, too; otherwise they lie in its own or below. May be
+    /// repeated.
+    #[arg(long, value_name = "DIR")]
+    pub(crate) allow_files: Vec<PathBuf>,
 }
 
 impl SceneArgs {
@@ -78,6 +83,11 @@ pub(crate) struct ReportArgs {
     /// The scene to measure.
     #[arg(value_name = "SCENE")]
     scene: PathBuf,
+
+    /// Let the scene name files in this folder, too; otherwise they lie in its own or below. May be
+    /// repeated.
+    #[arg(long, value_name = "DIR")]
+    allow_files: Vec<PathBuf>,
 
     /// The folder that report.md and its plots go into; without it the report goes to standard
     /// output.
@@ -294,7 +304,7 @@ impl FromStr for IsaChoice {
 impl ReportArgs {
     /// The user's own scene.
     pub(crate) fn scene(&self) -> SceneArgs {
-        SceneArgs { path: self.scene.clone(), strict: false }
+        SceneArgs { path: self.scene.clone(), strict: false, allow_files: self.allow_files.clone() }
     }
 }
 

@@ -11,6 +11,7 @@ mod output;
 mod pilot;
 mod render;
 mod report;
+mod scene_files;
 mod source;
 mod submission;
 mod submit;

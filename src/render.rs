@@ -34,7 +34,8 @@ use crate::{
     local,
     output::Output,
     pilot,
-    source::{SceneText, scene_folder},
+    scene_files::SceneFiles,
+    source::SceneText,
 };
 
 /// What there is to say about a finished render.
@@ -159,10 +160,10 @@ async fn place(
     stop: &CancellationToken,
 ) -> Result<Order, Failure> {
     let request = args.request(output.format());
-    let folder = scene_folder(&args.scene);
+    let files = SceneFiles::new(&args.scene);
     let (name, style) = (args.scene.name(), Console::drawing_style());
     let placing = spawn_blocking(move || {
-        let placed = request.place(&text, &|path: &str| fs::read(folder.join(Path::new(path))));
+        let placed = request.place(&text, &|name: &str| files.read(name));
         let mut report = draw_diagnostics(&name, &text, &placed.diagnostics, style);
         report.extend(placed.omitted.summary());
         text.ensure_unchanged().map(|()| (placed.order, report))

@@ -32,7 +32,8 @@ use crate::{
     failure::Failure,
     output::Output,
     render::Summary,
-    source::{SceneText, read_named_files, scene_folder},
+    scene_files::SceneFiles,
+    source::{SceneText, read_named_files},
     submission::{
         Action, Finished, JobEnd, JobState, Submission, SubmitOutcome, Submitted, Trouble,
     },
@@ -155,11 +156,11 @@ impl Shell<'_> {
             Action::Submit => {
                 let order = self.order();
                 let (client, text) = (self.client(), self.text.take().expect("it is sent once"));
-                let (folder, name) =
-                    (scene_folder(&self.args.picture.scene), self.args.picture.scene.name());
+                let scene = &self.args.picture.scene;
+                let (scene_files, name) = (SceneFiles::new(scene), scene.name());
                 self.start(|reports| async move {
                     let files = spawn_blocking(move || {
-                        let files = read_named_files(&text, &folder);
+                        let files = read_named_files(&text, &scene_files);
                         text.ensure_unchanged().map(|()| (text, files))
                     });
                     let report = match files.await.expect("reading never panics") {
