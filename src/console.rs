@@ -9,10 +9,14 @@ use std::{
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use rtfarm_core::read::Style;
 use rtfarm_job::Progress;
+use serde_json::json;
 use tokio::time::Instant;
 use tracing_subscriber::{EnvFilter, fmt::MakeWriter};
 
-use crate::args::{Command, LogFormat};
+use crate::{
+    args::{Command, LogFormat},
+    log_queue::LogQueue,
+};
 
 /// Standard error. Clones are the same one.
 #[derive(Debug, Clone, Default)]
@@ -20,7 +24,12 @@ pub(crate) struct Console {
     /// Set while a bar is on the screen; lines are then written above it.
     bar: Arc<Mutex<Option<ProgressBar>>>,
     wants_bar: bool,
+    /// Where lines wait to be written; without it they are written at once.
+    lines: Option<LogQueue>,
 }
+
+/// The longest that a process that ends waits for what it said to be read.
+const FAREWELL: Duration = Duration::from_secs(1);
 
 impl Console {
     /// Standard error without logs and bars.
@@ -37,7 +46,25 @@ impl Console {
             && io::stderr().is_terminal();
         let is_local_worker = matches!(command, Command::Worker(args) if args.parent.is_some());
         let level = if has_bar || is_local_worker { "warn" } else { "info" };
-        let console = Self { wants_bar: has_bar, ..Self::default() };
+        let bar = Arc::<Mutex<Option<ProgressBar>>>::default();
+        let describe = match format {
+            LogFormat::Text => {
+                |count| format!(" WARN {count} lines were dropped: nobody read them\n")
+            }
+            LogFormat::Json => |count| {
+                let message = "lines were dropped: nobody read them";
+                format!("{}\n", json!({ "level": "WARN", "message": message, "lines": count }))
+            },
+        };
+        let lines = LogQueue::start(describe, {
+            let bar = Arc::clone(&bar);
+            move |line| {
+                // Its clone, so that nobody waits for the bar while the line is written.
+                let bar = bar.lock().expect("drawing never panics").clone();
+                write_above(bar.as_ref(), line);
+            }
+        });
+        let console = Self { bar, wants_bar: has_bar, lines: Some(lines) };
         let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new(level));
         let lines = tracing_subscriber::fmt()
             .with_env_filter(filter)
@@ -53,6 +80,13 @@ impl Console {
     /// Writes a line.
     pub(crate) fn tell(&self, line: &str) {
         let _ = writeln!(self.make_writer(), "{line}");
+    }
+
+    /// Waits until all that was said is written, but not for ever.
+    pub(crate) fn close(&self) {
+        if let Some(lines) = &self.lines {
+            lines.flush(FAREWELL);
+        }
     }
 
     /// Writes what there is to say about a scene, unless that is nothing.
@@ -129,7 +163,19 @@ impl<'a> MakeWriter<'a> for Console {
     }
 }
 
-/// Collects a line and writes it in one piece, so that lines of several processes do not mix.
+/// Writes a line, above the bar if there is one.
+fn write_above(bar: Option<&ProgressBar>, line: &[u8]) {
+    // There is nobody to tell when standard error fails.
+    let write = || {
+        let _ = io::stderr().write_all(line);
+    };
+    match bar {
+        Some(bar) => bar.suspend(write),
+        None => write(),
+    }
+}
+
+/// Collects a line and hands it on in one piece, so that lines of several processes do not mix.
 #[derive(Debug)]
 pub(crate) struct LineWriter {
     console: Console,
@@ -149,14 +195,10 @@ impl Write for LineWriter {
 
 impl Drop for LineWriter {
     fn drop(&mut self) {
-        // There is nobody to tell when standard error fails.
-        let write = || {
-            let _ = io::stderr().write_all(&self.line);
-        };
-        let bar = self.console.lock().clone();
-        match bar {
-            Some(bar) => bar.suspend(write),
-            None => write(),
+        let line = std::mem::take(&mut self.line);
+        match &self.console.lines {
+            Some(lines) => lines.push(line),
+            None => write_above(self.console.lock().clone().as_ref(), &line),
         }
     }
 }

@@ -7,6 +7,7 @@ mod console;
 mod coordinator;
 mod failure;
 mod local;
+mod log_queue;
 mod output;
 mod pilot;
 mod render;
@@ -42,16 +43,22 @@ fn main() -> ExitCode {
         tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build();
     let runtime = match runtime {
         Ok(runtime) => runtime,
-        Err(error) => return Failure::from(error).tell(&console),
+        Err(error) => {
+            let code = Failure::from(error).tell(&console);
+            console.close();
+            return code;
+        }
     };
     // Local workers are started from this very thread, at whose end they would be killed.
     let result = runtime.block_on(run(args.command, &console));
     // What still blocks, such as a scene being read, is of no use to anyone.
     runtime.shutdown_background();
-    match result {
+    let code = match result {
         Ok(()) => ExitCode::SUCCESS,
         Err(failure) => failure.tell(&console),
-    }
+    };
+    console.close();
+    code
 }
 
 async fn run(command: Command, console: &Console) -> Result<(), Failure> {
