@@ -188,6 +188,10 @@ pub(crate) struct RenderArgs {
     #[arg(long, value_name = "S", default_value = "4", value_parser = parse_seconds)]
     pub(crate) lease_seconds: Duration,
 
+    /// How long to go on though no worker process does anything.
+    #[arg(long, value_name = "S", default_value = "60", value_parser = parse_seconds)]
+    pub(crate) patience: Duration,
+
     /// How log lines are written.
     #[arg(long, value_name = "FORMAT", default_value = "text")]
     pub(crate) log_format: LogFormat,
@@ -234,6 +238,10 @@ pub(crate) struct WorkerArgs {
     /// How long to go on without a coordinator.
     #[arg(long, value_name = "S", default_value = "60", value_parser = parse_seconds)]
     pub(crate) patience: Duration,
+
+    /// How long the tiles in hand may still take after SIGTERM.
+    #[arg(long, value_name = "S", default_value = "10", value_parser = parse_seconds)]
+    pub(crate) grace: Duration,
 
     /// How log lines are written.
     #[arg(long, value_name = "FORMAT", default_value = "text")]

@@ -16,7 +16,11 @@ use crate::{VERSION, args::CoordinatorArgs, failure::Failure, render::private_fo
 /// A client that sends nothing of its scene for this long is given up.
 pub(crate) const UPLOAD_SILENCE: Duration = Duration::from_secs(30);
 
-pub(crate) async fn run(args: CoordinatorArgs, stop: &CancellationToken) -> Result<(), Failure> {
+pub(crate) async fn run(
+    args: CoordinatorArgs,
+    stop: &CancellationToken,
+    terminate: &CancellationToken,
+) -> Result<(), Failure> {
     let listen = &args.listen;
     let mut addresses = lookup_host(listen).await.map_err(|error| {
         Failure::Input(anyhow!("`{listen}` is no address to listen on: {error}"))
@@ -42,5 +46,5 @@ pub(crate) async fn run(args: CoordinatorArgs, stop: &CancellationToken) -> Resu
         picture_folder: folder.path().to_owned(),
     });
     coordinator.run(Listener::Tcp(listener), stop.cancelled()).await?;
-    Err(Failure::Interrupted)
+    if terminate.is_cancelled() { Ok(()) } else { Err(Failure::Interrupted) }
 }

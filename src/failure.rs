@@ -4,6 +4,9 @@ use std::{fmt, process::ExitCode};
 
 use crate::console::Console;
 
+/// What a process ends with that somebody stopped.
+pub(crate) const INTERRUPTED: u8 = 130;
+
 /// Why a command did not do what it was asked to.
 #[derive(Debug)]
 pub(crate) enum Failure {
@@ -39,7 +42,7 @@ impl Failure {
         match self {
             Self::Other(_) => 1,
             Self::Input(_) | Self::Told => 2,
-            Self::Interrupted => 130,
+            Self::Interrupted => INTERRUPTED,
         }
     }
 

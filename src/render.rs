@@ -255,12 +255,12 @@ async fn render_with_workers(
         isa: args.isa.0,
         log_format: args.log_format,
     };
-    let mut children = Children::start(workers, &setup, console).context("cannot start workers")?;
+    let mut children = Children::start(workers, setup, console).context("cannot start workers")?;
 
     let rendered = tokio::select! {
         rendered = wait(&job, console) => rendered,
-        reason = children.watch(&coordinator) => {
-            Err(Failure::Other(anyhow!("all workers are dead; the last one: {reason}")))
+        reason = children.keep_up(&coordinator, args.patience) => {
+            Err(Failure::Other(anyhow!(reason)))
         }
         () = stop.cancelled() => Err(Failure::Interrupted),
     };

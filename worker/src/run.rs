@@ -38,8 +38,12 @@ use crate::{
     worker::Worker,
 };
 
-/// Works for the coordinator until that sends it home or `shutdown` comes.
-pub async fn run(config: Config, shutdown: impl Future<Output = ()>) -> Result<(), WorkerError> {
+/// Works for the coordinator until that sends it home or `shutdown` comes, which says how long the
+/// tiles in hand may still take.
+pub async fn run(
+    config: Config,
+    shutdown: impl Future<Output = Duration>,
+) -> Result<(), WorkerError> {
     let nonce = random()?;
     let mut worker = Worker::new(&config, nonce, now());
     let mut shell = Shell::new(config, nonce)?;
@@ -59,9 +63,9 @@ pub async fn run(config: Config, shutdown: impl Future<Output = ()>) -> Result<(
             }
             Some(()) = shell.beats.recv() => worker.on_beat(now()),
             () = sleep_until(worker.wake_at()) => worker.on_tick(now()),
-            () = &mut shutdown, if !is_stopped => {
+            grace = &mut shutdown, if !is_stopped => {
                 is_stopped = true;
-                worker.on_stop(now());
+                worker.on_stop(grace, now());
             }
         }
     }
