@@ -25,7 +25,7 @@ const FIRST_PAUSE: Duration = Duration::from_millis(100);
 const LONGEST_PAUSE: Duration = Duration::from_secs(1);
 
 /// Connections wait for the server so many at a time; the rest waits in the system's queue.
-const WAITING: usize = 16;
+pub(crate) const WAITING: usize = 16;
 
 /// A connection on which the other side has to say something soon.
 #[derive(Debug)]
@@ -39,12 +39,6 @@ impl<S> Greeted<S> {
     fn new(stream: S, patience: Duration) -> Self {
         Self { stream, deadline: Some(Box::pin(sleep(patience))) }
     }
-}
-
-/// Where accepted connections are handed on, and where they come out.
-pub(crate) fn queue<S>()
--> (mpsc::Sender<io::Result<Greeted<S>>>, mpsc::Receiver<io::Result<Greeted<S>>>) {
-    mpsc::channel(WAITING)
 }
 
 /// Accepts connections and hands them on, until nobody takes them any more.
@@ -160,7 +154,7 @@ mod tests {
             attempts += 1;
             Poll::Ready(Err::<UnixStream, _>(io::Error::from_raw_os_error(24)))
         };
-        let (send, _connections) = queue();
+        let (send, _connections) = mpsc::channel(WAITING);
         timeout(Duration::from_millis(250), accept_all(accept, send)).await.unwrap_err();
         assert!((1..=2).contains(&attempts), "{attempts} attempts");
     }

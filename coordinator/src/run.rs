@@ -12,13 +12,14 @@ use rtfarm_proto::JobId;
 use tokio::{
     io::{AsyncRead, AsyncWrite},
     net::{TcpListener, UnixListener},
+    sync::mpsc,
 };
 use tokio_stream::wrappers::ReceiverStream;
 use tokio_util::sync::CancellationToken;
 use tonic::transport::server::{Connected, Router};
 
 use crate::{
-    accept::{accept_all, queue},
+    accept::{WAITING, accept_all},
     job::Job,
     service,
     shell::{Config, Shell, SubmitError},
@@ -122,7 +123,7 @@ async fn serve_accepted<S>(
 where
     S: AsyncRead + AsyncWrite + Connected + Unpin + Send + 'static,
 {
-    let (send, connections) = queue();
+    let (send, connections) = mpsc::channel(WAITING);
     let connections = ReceiverStream::new(connections);
     let serve = router.serve_with_incoming_shutdown(connections, stop.cancelled_owned());
     // Accepting ends when nobody takes connections any more.
