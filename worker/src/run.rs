@@ -16,7 +16,7 @@ use std::{
 use rayon::{ThreadPool, ThreadPoolBuilder};
 use rtfarm_core::{prepared::SceneHash, render::render_tile, tile::TileId};
 use rtfarm_proto::{
-    LeaseName, pixels_to_bytes,
+    Address, LeaseName, pixels_to_bytes,
     wire::{self, farm_client::FarmClient},
 };
 use tokio::{
@@ -191,8 +191,9 @@ impl Shell {
     fn fetch(&mut self, task: TaskId, job: Arc<Job>, silence: Duration) {
         let client = self.client.clone().expect("a worker connects before it fetches");
         let (scene, pulse) = (job.scene, Arc::clone(&self.pulse));
+        let is_local = matches!(self.config.coordinator, Address::Unix(_));
         self.start(task, async move {
-            match load(job, silence, client, pulse).await {
+            match load(job, is_local, silence, client, pulse).await {
                 Ok(loaded) => Report::Fetched(scene, loaded),
                 Err(error) => Report::FetchFailed(error),
             }
