@@ -16,6 +16,7 @@ use tracing_subscriber::{EnvFilter, fmt::MakeWriter};
 use crate::{
     args::{Command, LogFormat},
     log_queue::LogQueue,
+    plain::plain,
 };
 
 /// Standard error. Clones are the same one.
@@ -92,7 +93,9 @@ impl Console {
     /// Writes what there is to say about a scene, unless that is nothing.
     pub(crate) fn tell_report(&self, report: &str) {
         if !report.is_empty() {
-            self.tell(report.trim_end());
+            let mut writer = self.make_writer();
+            writer.is_drawn = true;
+            let _ = writeln!(writer, "{}", report.trim_end());
         }
     }
 
@@ -159,7 +162,7 @@ impl<'a> MakeWriter<'a> for Console {
     type Writer = LineWriter;
 
     fn make_writer(&'a self) -> LineWriter {
-        LineWriter { console: self.clone(), line: Vec::new() }
+        LineWriter { console: self.clone(), line: Vec::new(), is_drawn: false }
     }
 }
 
@@ -180,6 +183,8 @@ fn write_above(bar: Option<&ProgressBar>, line: &[u8]) {
 pub(crate) struct LineWriter {
     console: Console,
     line: Vec<u8>,
+    /// Whether it has colours in it, which are this program's own.
+    is_drawn: bool,
 }
 
 impl Write for LineWriter {
@@ -195,7 +200,10 @@ impl Write for LineWriter {
 
 impl Drop for LineWriter {
     fn drop(&mut self) {
-        let line = std::mem::take(&mut self.line);
+        let line = match std::mem::take(&mut self.line) {
+            line if self.is_drawn => line,
+            line => plain(&String::from_utf8_lossy(&line)).into_bytes(),
+        };
         match &self.console.lines {
             Some(lines) => lines.push(line),
             None => write_above(self.console.lock().clone().as_ref(), &line),

@@ -2,7 +2,7 @@
 
 use std::{fmt, process::ExitCode};
 
-use crate::console::Console;
+use crate::{console::Console, plain::plain};
 
 /// What a process ends with that somebody stopped.
 pub(crate) const INTERRUPTED: u8 = 130;
@@ -49,7 +49,8 @@ impl Failure {
     /// Tells the user, and chooses the exit code.
     pub(crate) fn tell(&self, console: &Console) -> ExitCode {
         if !matches!(self, Self::Told) {
-            console.tell(&format!("error: {self}"));
+            // Some of it may come from another machine.
+            console.tell(&plain(&format!("error: {self}")));
         }
         ExitCode::from(self.exit_code())
     }

@@ -10,6 +10,7 @@ mod local;
 mod log_queue;
 mod output;
 mod pilot;
+mod plain;
 mod render;
 mod report;
 mod scene_files;
