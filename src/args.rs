@@ -34,6 +34,8 @@ pub(crate) enum Command {
     Worker(WorkerArgs),
     /// Have a farm render a scene.
     Submit(SubmitArgs),
+    /// Fetch the picture of a finished job that a farm still keeps.
+    Image(ImageArgs),
     /// Say what is wrong with a scene, and what it needs.
     Check(CheckArgs),
     /// Measure speed against error of a scene, whose picture at many samples stands for the truth.
@@ -270,6 +272,21 @@ pub(crate) struct SubmitArgs {
     pub(crate) log_format: LogFormat,
 }
 
+#[derive(Debug, ClapArgs)]
+pub(crate) struct ImageArgs {
+    /// The job's number.
+    #[arg(value_name = "JOB")]
+    pub(crate) job: u64,
+
+    /// Where the picture goes; the extension should be that of the file that was asked for.
+    #[arg(short, long, value_name = "FILE")]
+    pub(crate) output: PathBuf,
+
+    /// Where the coordinator is: `http://host:7878` or `unix:/path/socket`.
+    #[arg(long, value_name = "URL")]
+    pub(crate) coordinator: Address,
+}
+
 /// Yes or no.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 enum Switch {
@@ -370,7 +387,7 @@ impl Command {
             Self::Coordinator(args) => args.log_format,
             Self::Worker(args) => args.log_format,
             Self::Submit(args) => args.log_format,
-            Self::Check(_) | Self::Report(_) => LogFormat::Text,
+            Self::Check(_) | Self::Image(_) | Self::Report(_) => LogFormat::Text,
         }
     }
 }

@@ -6,6 +6,7 @@ mod children;
 mod console;
 mod coordinator;
 mod failure;
+mod image;
 mod local;
 mod log_queue;
 mod output;
@@ -69,6 +70,7 @@ async fn run(command: Command, console: &Console) -> Result<(), Failure> {
         Command::Coordinator(args) => coordinator::run(args, &stop, &terminate).await,
         Command::Worker(args) => worker::run(args, &stop, &terminate).await,
         Command::Submit(args) => submit::run(args, console, &stop).await,
+        Command::Image(args) => image::run(args, &stop).await,
         Command::Report(args) => report::run(args, console, &stop).await,
         Command::Check(args) => check::run(args, console, &stop).await,
     }
