@@ -11,7 +11,7 @@ use rtfarm_coordinator::{Config, Coordinator, Listener};
 use tokio::net::{TcpListener, lookup_host};
 use tokio_util::sync::CancellationToken;
 
-use crate::{VERSION, args::CoordinatorArgs, failure::Failure, render::private_folder};
+use crate::{VERSION, args::CoordinatorArgs, failure::Failure, private_folder::PrivateFolder};
 
 /// A client that sends nothing of its scene for this long is given up.
 pub(crate) const UPLOAD_SILENCE: Duration = Duration::from_secs(30);
@@ -32,7 +32,7 @@ pub(crate) async fn run(
              --insecure listens there all the same"
         )));
     }
-    let folder = private_folder(&args.state.unwrap_or_else(env::temp_dir))?;
+    let folder = PrivateFolder::new(&args.state.unwrap_or_else(env::temp_dir))?;
     let listener =
         TcpListener::bind(address).await.with_context(|| format!("cannot listen on {address}"))?;
     writeln!(io::stdout().lock(), "listening on http://{}", listener.local_addr()?)

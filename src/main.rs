@@ -12,6 +12,7 @@ mod log_queue;
 mod output;
 mod pilot;
 mod plain;
+mod private_folder;
 mod render;
 mod report;
 mod scene_files;

@@ -1,10 +1,7 @@
 //! `rtfarm render`: a picture from this machine alone.
 
 use std::{
-    fs,
     io::{self, Write},
-    os::unix::fs::PermissionsExt,
-    path::Path,
     sync::Arc,
     time::Duration,
 };
@@ -20,7 +17,6 @@ use rtfarm_core::{
 use rtfarm_job::{Order, Outcome, Progress, Refusal};
 use rtfarm_picture::Picture;
 use rtfarm_proto::Address;
-use tempfile::TempDir;
 use tokio::{net::UnixListener, sync::watch, task::spawn_blocking, time::Instant};
 use tokio_util::sync::CancellationToken;
 
@@ -34,6 +30,7 @@ use crate::{
     local,
     output::Output,
     pilot,
+    private_folder::PrivateFolder,
     scene_files::SceneFiles,
     source::SceneText,
 };
@@ -228,7 +225,7 @@ async fn render_with_workers(
     stop: &CancellationToken,
 ) -> Result<Summary, Failure> {
     let (sampling, transfer) = (order.settings.quality.sampling, order.transfer);
-    let folder = private_folder(&std::env::temp_dir())?;
+    let folder = PrivateFolder::new(&std::env::temp_dir())?;
     let socket = folder.path().join("socket");
     let listener = UnixListener::bind(&socket)
         .with_context(|| format!("cannot listen on {}", socket.display()))?;
@@ -283,15 +280,6 @@ async fn render_with_workers(
     let progress = job.progress();
     let (size, tally) = (job.picture().size(), progress.borrow().tally);
     Ok(Summary { size, tally, sampling, transfer, rendering: written?, workers })
-}
-
-/// A folder that only this user can look into; it goes when the answer does.
-pub(crate) fn private_folder(parent: &Path) -> anyhow::Result<TempDir> {
-    tempfile::Builder::new()
-        .prefix("rtfarm-")
-        .permissions(fs::Permissions::from_mode(0o700))
-        .tempdir_in(parent)
-        .with_context(|| format!("cannot make a folder in {}", parent.display()))
 }
 
 /// Shows how far a job is until it ends.
