@@ -433,6 +433,22 @@ fn workers_die_with_a_killed_coordinator() {
     for (_, process) in workers {
         wait_for_end_of(process);
     }
+    assert!(fs::read_dir(place.path("tmp")).unwrap().count() > 0, "a folder is left");
+    place.render("next.png", &["--size", "16x16", "--workers", "1"]);
+    place.check_nothing_is_left();
+}
+
+#[test]
+fn a_worker_that_stays_stopped_is_replaced() {
+    let place = Place::new();
+    let args = [&["render", "scene.rt", "-o", "out.png", "--workers", "1"], &SLOW[..]].concat();
+    let mut render = place.start("render.log", &args);
+    poll(|| (render.tiles_done() >= 1).then_some(()));
+    kill_process(pid(render.workers()[0].1), Signal::STOP).unwrap();
+    poll(|| (render.workers().len() == 2).then_some(()));
+    render.signal(Signal::INT);
+    assert_eq!(render.wait().code(), Some(130));
+    place.check_nothing_is_left();
 }
 
 /// Checks that a command fails with one line that says `reason`, and changes nothing.
@@ -503,9 +519,17 @@ fn a_port_in_use_and_a_missing_coordinator_are_told() {
     place.check_nothing_is_left();
 }
 
-#[test]
-fn a_full_disk_is_told_at_once() {
-    let place = Place::new();
+/// A farm's coordinator, started, and its address.
+fn start_coordinator(place: &Place) -> (Process, String) {
+    let mut coordinator =
+        place.start("coordinator.log", &["coordinator", "--listen", "127.0.0.1:0"]);
+    let line = coordinator.read_line();
+    let url = line.trim().strip_prefix("listening on ").expect(&line).to_owned();
+    (coordinator, url)
+}
+
+/// Does `check` with a small disk at `disk` in the place; the disk is unmounted by the end.
+fn with_small_disk(place: &Place, check: impl FnOnce() + std::panic::UnwindSafe) {
     let disk = place.path("disk");
     fs::create_dir(&disk).unwrap();
     let mounted = Command::new("mount")
@@ -517,26 +541,44 @@ fn a_full_disk_is_told_at_once() {
         eprintln!("SKIPPED: only root can mount the small disk that this test fills");
         return;
     }
-    let check = std::panic::catch_unwind(|| {
+    let checked = std::panic::catch_unwind(check);
+    assert!(Command::new("umount").arg(&disk).status().unwrap().success());
+    checked.unwrap();
+}
+
+#[test]
+fn a_full_disk_is_told_at_once() {
+    let place = Place::new();
+    with_small_disk(&place, || {
         for workers in ["0", "2"] {
             let size = ["--size", "512x512", "--samples", "1", "--workers", workers];
             let args = [&["render", "scene.rt", "-o", "disk/out.png"], &size[..]].concat();
             check_refused(&place, &args, 1, "No space left on device");
         }
-        assert_eq!(fs::read_dir(&disk).unwrap().count(), 0);
+        assert_eq!(fs::read_dir(place.path("disk")).unwrap().count(), 0);
         place.check_nothing_is_left();
     });
-    assert!(Command::new("umount").arg(&disk).status().unwrap().success());
-    check.unwrap();
 }
 
-/// A farm's coordinator, started, and its address.
-fn start_coordinator(place: &Place) -> (Process, String) {
-    let mut coordinator =
-        place.start("coordinator.log", &["coordinator", "--listen", "127.0.0.1:0"]);
-    let line = coordinator.read_line();
-    let url = line.trim().strip_prefix("listening on ").expect(&line).to_owned();
-    (coordinator, url)
+#[test]
+fn a_picture_for_which_there_is_no_room_is_fetched_again() {
+    let place = Place::new();
+    let (_coordinator, url) = start_coordinator(&place);
+    let _worker = place.start("worker.log", &["worker", "--threads", "1", "--coordinator", &url]);
+    let picture = ["--size", "256x256", "--samples", "1"];
+    with_small_disk(&place, || {
+        let args = ["submit", "scene.rt", "-o", "disk/out.exr", "--coordinator", &url];
+        let mut submit = place.start("submit.log", &[&args[..], &picture].concat());
+        assert_eq!(submit.wait().code(), Some(1));
+        let log = submit.log();
+        assert!(log.contains("No space left on device"), "{log}");
+        let told = log.split_once("rtfarm ").expect(&log).1.split_once(" -o").expect(&log).0;
+        let told: Vec<&str> = told.split(' ').collect();
+        let mut image = place.start("image.log", &[&told[..], &["-o", "out.exr"]].concat());
+        assert!(image.wait().success(), "{told:?}: {}", image.log());
+        let here = place.render("here.exr", &[&picture[..], &["--workers", "0"]].concat());
+        assert!(fs::read(place.path("out.exr")).unwrap() == here);
+    });
 }
 
 #[test]
