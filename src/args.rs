@@ -34,6 +34,8 @@ pub(crate) enum Command {
     Worker(WorkerArgs),
     /// Have a farm render a scene.
     Submit(SubmitArgs),
+    /// Fetch the picture of a finished job that a farm still keeps.
+    Image(ImageArgs),
     /// Say what is wrong with a scene, and what it needs.
     Check(CheckArgs),
     /// Measure speed against error of a scene, whose picture at many samples stands for the truth.
@@ -50,6 +52,11 @@ pub(crate) struct SceneArgs {
     /// Make an error of every warning.
     #[arg(long)]
     pub(crate) strict: bool,
+
+    /// Let the scene name files in this folder, too; otherwise they lie in its own or below. May be
+    /// repeated.
+    #[arg(long, value_name = "DIR")]
+    pub(crate) allow_files: Vec<PathBuf>,
 }
 
 impl SceneArgs {
@@ -78,6 +85,11 @@ pub(crate) struct ReportArgs {
     /// The scene to measure.
     #[arg(value_name = "SCENE")]
     scene: PathBuf,
+
+    /// Let the scene name files in this folder, too; otherwise they lie in its own or below. May be
+    /// repeated.
+    #[arg(long, value_name = "DIR")]
+    allow_files: Vec<PathBuf>,
 
     /// The folder that report.md and its plots go into; without it the report goes to standard
     /// output.
@@ -178,6 +190,10 @@ pub(crate) struct RenderArgs {
     #[arg(long, value_name = "S", default_value = "4", value_parser = parse_seconds)]
     pub(crate) lease_seconds: Duration,
 
+    /// How long to go on though no worker process does anything.
+    #[arg(long, value_name = "S", default_value = "60", value_parser = parse_seconds)]
+    pub(crate) patience: Duration,
+
     /// How log lines are written.
     #[arg(long, value_name = "FORMAT", default_value = "text")]
     pub(crate) log_format: LogFormat,
@@ -225,6 +241,10 @@ pub(crate) struct WorkerArgs {
     #[arg(long, value_name = "S", default_value = "60", value_parser = parse_seconds)]
     pub(crate) patience: Duration,
 
+    /// How long the tiles in hand may still take after SIGTERM.
+    #[arg(long, value_name = "S", default_value = "10", value_parser = parse_seconds)]
+    pub(crate) grace: Duration,
+
     /// How log lines are written.
     #[arg(long, value_name = "FORMAT", default_value = "text")]
     pub(crate) log_format: LogFormat,
@@ -250,6 +270,21 @@ pub(crate) struct SubmitArgs {
     /// How log lines are written.
     #[arg(long, value_name = "FORMAT", default_value = "text")]
     pub(crate) log_format: LogFormat,
+}
+
+#[derive(Debug, ClapArgs)]
+pub(crate) struct ImageArgs {
+    /// The job's number.
+    #[arg(value_name = "JOB")]
+    pub(crate) job: u64,
+
+    /// Where the picture goes; the extension should be that of the file that was asked for.
+    #[arg(short, long, value_name = "FILE")]
+    pub(crate) output: PathBuf,
+
+    /// Where the coordinator is: `http://host:7878` or `unix:/path/socket`.
+    #[arg(long, value_name = "URL")]
+    pub(crate) coordinator: Address,
 }
 
 /// Yes or no.
@@ -294,7 +329,7 @@ impl FromStr for IsaChoice {
 impl ReportArgs {
     /// The user's own scene.
     pub(crate) fn scene(&self) -> SceneArgs {
-        SceneArgs { path: self.scene.clone(), strict: false }
+        SceneArgs { path: self.scene.clone(), strict: false, allow_files: self.allow_files.clone() }
     }
 }
 
@@ -352,7 +387,7 @@ impl Command {
             Self::Coordinator(args) => args.log_format,
             Self::Worker(args) => args.log_format,
             Self::Submit(args) => args.log_format,
-            Self::Check(_) | Self::Report(_) => LogFormat::Text,
+            Self::Check(_) | Self::Image(_) | Self::Report(_) => LogFormat::Text,
         }
     }
 }

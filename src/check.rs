@@ -1,9 +1,6 @@
 //! `rtfarm check`: what is wrong with a scene, and what it needs.
 
-use std::{
-    fs,
-    io::{self, Write},
-};
+use std::io::{self, Write};
 
 use anyhow::Context;
 use rtfarm_core::{
@@ -18,10 +15,7 @@ use tokio::task::spawn_blocking;
 use tokio_util::sync::CancellationToken;
 
 use crate::{
-    args::CheckArgs,
-    console::Console,
-    failure::Failure,
-    source::{SceneText, scene_folder},
+    args::CheckArgs, console::Console, failure::Failure, scene_files::SceneFiles, source::SceneText,
 };
 
 pub(crate) async fn run(
@@ -33,8 +27,8 @@ pub(crate) async fn run(
     let name = args.scene.name();
     let style = Console::drawing_style();
     let checking = spawn_blocking(move || {
-        let folder = scene_folder(&args.scene);
-        let mut reading = read_scene(&text, &|path: &str| fs::read(folder.join(path)));
+        let files = SceneFiles::new(&args.scene);
+        let mut reading = read_scene(&text, &|name: &str| files.read(name));
         if args.scene.strict {
             reading = reading.into_strict();
         }

@@ -9,6 +9,7 @@ use std::{
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use rtfarm_core::language::Style;
 use rtfarm_job::Progress;
+use serde_json::json;
 use tokio::time::Instant;
 use tracing_subscriber::{
     filter::{LevelFilter, Targets},
@@ -17,7 +18,11 @@ use tracing_subscriber::{
     util::SubscriberInitExt,
 };
 
-use crate::args::{Command, LogFormat};
+use crate::{
+    args::{Command, LogFormat},
+    log_queue::LogQueue,
+    plain::plain,
+};
 
 /// Standard error. Clones are the same one.
 #[derive(Debug, Clone, Default)]
@@ -25,7 +30,12 @@ pub(crate) struct Console {
     /// Set while a bar is on the screen; lines are then written above it.
     bar: Arc<Mutex<Option<ProgressBar>>>,
     wants_bar: bool,
+    /// Where lines wait to be written; without it they are written at once.
+    lines: Option<LogQueue>,
 }
+
+/// The longest that a process that ends waits for what it said to be read.
+const FAREWELL: Duration = Duration::from_secs(1);
 
 impl Console {
     /// Standard error without logs and bars.
@@ -42,7 +52,25 @@ impl Console {
             && io::stderr().is_terminal();
         let is_local_worker = matches!(command, Command::Worker(args) if args.parent.is_some());
         let level = if has_bar || is_local_worker { LevelFilter::WARN } else { LevelFilter::INFO };
-        let console = Self { wants_bar: has_bar, ..Self::default() };
+        let bar = Arc::<Mutex<Option<ProgressBar>>>::default();
+        let describe = match format {
+            LogFormat::Text => {
+                |count| format!(" WARN {count} lines were dropped: nobody read them\n")
+            }
+            LogFormat::Json => |count| {
+                let message = "lines were dropped: nobody read them";
+                format!("{}\n", json!({ "level": "WARN", "message": message, "lines": count }))
+            },
+        };
+        let lines = LogQueue::start(describe, {
+            let bar = Arc::clone(&bar);
+            move |line| {
+                // Its clone, so that nobody waits for the bar while the line is written.
+                let bar = bar.lock().expect("drawing never panics").clone();
+                write_above(bar.as_ref(), line);
+            }
+        });
+        let console = Self { bar, wants_bar: has_bar, lines: Some(lines) };
         let filter = filter(std::env::var("RUST_LOG").ok().as_deref(), level);
         let lines = tracing_subscriber::fmt()
             .with_max_level(LevelFilter::TRACE)
@@ -60,10 +88,19 @@ impl Console {
         let _ = writeln!(self.make_writer(), "{line}");
     }
 
+    /// Waits until all that was said is written, but not for ever.
+    pub(crate) fn close(&self) {
+        if let Some(lines) = &self.lines {
+            lines.flush(FAREWELL);
+        }
+    }
+
     /// Writes what there is to say about a scene, unless that is nothing.
     pub(crate) fn tell_report(&self, report: &str) {
         if !report.is_empty() {
-            self.tell(report.trim_end());
+            let mut writer = self.make_writer();
+            writer.is_drawn = true;
+            let _ = writeln!(writer, "{}", report.trim_end());
         }
     }
 
@@ -130,15 +167,29 @@ impl<'a> MakeWriter<'a> for Console {
     type Writer = LineWriter;
 
     fn make_writer(&'a self) -> LineWriter {
-        LineWriter { console: self.clone(), line: Vec::new() }
+        LineWriter { console: self.clone(), line: Vec::new(), is_drawn: false }
     }
 }
 
-/// Collects a line and writes it in one piece, so that lines of several processes do not mix.
+/// Writes a line, above the bar if there is one.
+fn write_above(bar: Option<&ProgressBar>, line: &[u8]) {
+    // There is nobody to tell when standard error fails.
+    let write = || {
+        let _ = io::stderr().write_all(line);
+    };
+    match bar {
+        Some(bar) => bar.suspend(write),
+        None => write(),
+    }
+}
+
+/// Collects a line and hands it on in one piece, so that lines of several processes do not mix.
 #[derive(Debug)]
 pub(crate) struct LineWriter {
     console: Console,
     line: Vec<u8>,
+    /// Whether it has colours in it, which are this program's own.
+    is_drawn: bool,
 }
 
 impl Write for LineWriter {
@@ -154,14 +205,13 @@ impl Write for LineWriter {
 
 impl Drop for LineWriter {
     fn drop(&mut self) {
-        // There is nobody to tell when standard error fails.
-        let write = || {
-            let _ = io::stderr().write_all(&self.line);
+        let line = match std::mem::take(&mut self.line) {
+            line if self.is_drawn => line,
+            line => plain(&String::from_utf8_lossy(&line)).into_bytes(),
         };
-        let bar = self.console.lock().clone();
-        match bar {
-            Some(bar) => bar.suspend(write),
-            None => write(),
+        match &self.console.lines {
+            Some(lines) => lines.push(line),
+            None => write_above(self.console.lock().clone().as_ref(), &line),
         }
     }
 }

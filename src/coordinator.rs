@@ -3,6 +3,7 @@
 use std::{
     env,
     io::{self, Write},
+    time::Duration,
 };
 
 use anyhow::{Context, anyhow};
@@ -10,9 +11,16 @@ use rtfarm_coordinator::{Config, Coordinator, Listener};
 use tokio::net::{TcpListener, lookup_host};
 use tokio_util::sync::CancellationToken;
 
-use crate::{VERSION, args::CoordinatorArgs, failure::Failure, render::private_folder};
+use crate::{VERSION, args::CoordinatorArgs, failure::Failure, private_folder::PrivateFolder};
 
-pub(crate) async fn run(args: CoordinatorArgs, stop: &CancellationToken) -> Result<(), Failure> {
+/// A client that sends nothing of its scene for this long is given up.
+pub(crate) const UPLOAD_SILENCE: Duration = Duration::from_secs(30);
+
+pub(crate) async fn run(
+    args: CoordinatorArgs,
+    stop: &CancellationToken,
+    terminate: &CancellationToken,
+) -> Result<(), Failure> {
     let listen = &args.listen;
     let mut addresses = lookup_host(listen).await.map_err(|error| {
         Failure::Input(anyhow!("`{listen}` is no address to listen on: {error}"))
@@ -24,7 +32,7 @@ pub(crate) async fn run(args: CoordinatorArgs, stop: &CancellationToken) -> Resu
              --insecure listens there all the same"
         )));
     }
-    let folder = private_folder(&args.state.unwrap_or_else(env::temp_dir))?;
+    let folder = PrivateFolder::new(&args.state.unwrap_or_else(env::temp_dir))?;
     let listener =
         TcpListener::bind(address).await.with_context(|| format!("cannot listen on {address}"))?;
     writeln!(io::stdout().lock(), "listening on http://{}", listener.local_addr()?)
@@ -33,9 +41,10 @@ pub(crate) async fn run(args: CoordinatorArgs, stop: &CancellationToken) -> Resu
     let coordinator = Coordinator::new(Config {
         version: VERSION.to_owned(),
         term: args.lease_seconds,
+        upload_silence: UPLOAD_SILENCE,
         scene_folder: folder.path().to_owned(),
         picture_folder: folder.path().to_owned(),
     });
     coordinator.run(Listener::Tcp(listener), stop.cancelled()).await?;
-    Err(Failure::Interrupted)
+    if terminate.is_cancelled() { Ok(()) } else { Err(Failure::Interrupted) }
 }

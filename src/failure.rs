@@ -2,7 +2,10 @@
 
 use std::{fmt, process::ExitCode};
 
-use crate::console::Console;
+use crate::{console::Console, plain::plain};
+
+/// What a process ends with that somebody stopped.
+pub(crate) const INTERRUPTED: u8 = 130;
 
 /// Why a command did not do what it was asked to.
 #[derive(Debug)]
@@ -39,14 +42,15 @@ impl Failure {
         match self {
             Self::Other(_) => 1,
             Self::Input(_) | Self::Told => 2,
-            Self::Interrupted => 130,
+            Self::Interrupted => INTERRUPTED,
         }
     }
 
     /// Tells the user, and chooses the exit code.
     pub(crate) fn tell(&self, console: &Console) -> ExitCode {
         if !matches!(self, Self::Told) {
-            console.tell(&format!("error: {self}"));
+            // Some of it may come from another machine.
+            console.tell(&plain(&format!("error: {self}")));
         }
         ExitCode::from(self.exit_code())
     }

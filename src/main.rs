@@ -6,11 +6,16 @@ mod children;
 mod console;
 mod coordinator;
 mod failure;
+mod image;
 mod local;
+mod log_queue;
 mod output;
 mod pilot;
+mod plain;
+mod private_folder;
 mod render;
 mod report;
+mod scene_files;
 mod source;
 mod submission;
 mod submit;
@@ -41,40 +46,63 @@ fn main() -> ExitCode {
         tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build();
     let runtime = match runtime {
         Ok(runtime) => runtime,
-        Err(error) => return Failure::from(error).tell(&console),
+        Err(error) => {
+            let code = Failure::from(error).tell(&console);
+            console.close();
+            return code;
+        }
     };
     // Local workers are started from this very thread, at whose end they would be killed.
     let result = runtime.block_on(run(args.command, &console));
     // What still blocks, such as a scene being read, is of no use to anyone.
     runtime.shutdown_background();
-    match result {
+    let code = match result {
         Ok(()) => ExitCode::SUCCESS,
         Err(failure) => failure.tell(&console),
-    }
+    };
+    console.close();
+    code
 }
 
 async fn run(command: Command, console: &Console) -> Result<(), Failure> {
-    let stop = stop_on_signals()?;
+    let Signals { stop, terminate } = Signals::listen()?;
     match command {
         Command::Render(args) => render::run(args, console, &stop).await,
-        Command::Coordinator(args) => coordinator::run(args, &stop).await,
-        Command::Worker(args) => worker::run(args, &stop).await,
+        Command::Coordinator(args) => coordinator::run(args, &stop, &terminate).await,
+        Command::Worker(args) => worker::run(args, &stop, &terminate).await,
         Command::Submit(args) => submit::run(args, console, &stop).await,
+        Command::Image(args) => image::run(args, &stop).await,
         Command::Report(args) => report::run(args, console, &stop).await,
         Command::Check(args) => check::run(args, console, &stop).await,
     }
 }
 
-/// A token that is cancelled when somebody wants this process to end.
-fn stop_on_signals() -> Result<CancellationToken, Failure> {
-    let stop = CancellationToken::new();
-    for kind in [SignalKind::interrupt(), SignalKind::terminate(), SignalKind::hangup()] {
-        let mut signals = signal(kind)?;
-        let stop = stop.clone();
-        tokio::spawn(async move {
-            signals.recv().await;
-            stop.cancel();
-        });
+/// Tokens that are cancelled when somebody wants this process to end.
+struct Signals {
+    stop: CancellationToken,
+    /// Cancelled before `stop` by SIGTERM, by which a service is ended in good order.
+    terminate: CancellationToken,
+}
+
+impl Signals {
+    /// Listens from now on. An interruption of a process that is to end already ends it at once.
+    fn listen() -> Result<Self, Failure> {
+        let (stop, terminate) = (CancellationToken::new(), CancellationToken::new());
+        for kind in [SignalKind::interrupt(), SignalKind::terminate(), SignalKind::hangup()] {
+            let mut signals = signal(kind)?;
+            let (stop, terminate) = (stop.clone(), terminate.clone());
+            tokio::spawn(async move {
+                while signals.recv().await.is_some() {
+                    if stop.is_cancelled() && kind == SignalKind::interrupt() {
+                        std::process::exit(failure::INTERRUPTED.into());
+                    }
+                    if kind == SignalKind::terminate() {
+                        terminate.cancel();
+                    }
+                    stop.cancel();
+                }
+            });
+        }
+        Ok(Self { stop, terminate })
     }
-    Ok(stop)
 }

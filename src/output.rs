@@ -1,7 +1,7 @@
 //! The picture's file: checked before anything is done, written beside its place, then renamed.
 
 use std::{
-    fs,
+    fs::{self, File},
     io::{self, BufWriter, Seek, SeekFrom, Write},
     os::unix::fs::PermissionsExt,
     path::{Path, PathBuf},
@@ -83,7 +83,11 @@ impl Output {
         let mut out = OutputFile { file: BufWriter::with_capacity(1 << 16, &mut file), stop };
         write(&mut out).and_then(|()| out.file.flush()).with_context(in_place)?;
         drop(out);
+        // After a power cut there is the old file or the whole new one.
+        file.as_file().sync_all().with_context(in_place)?;
         file.persist(&self.path).map_err(|error| error.error).with_context(in_place)?;
+        // Some file systems cannot sync a folder; the picture is written all the same.
+        let _ = File::open(self.folder()).and_then(|folder| folder.sync_all());
         Ok(())
     }
 }

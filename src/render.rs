@@ -1,10 +1,7 @@
 //! `rtfarm render`: a picture from this machine alone.
 
 use std::{
-    fs,
     io::{self, Write},
-    os::unix::fs::PermissionsExt,
-    path::Path,
     sync::Arc,
     time::Duration,
 };
@@ -20,7 +17,6 @@ use rtfarm_core::{
 use rtfarm_job::{Order, Outcome, Progress, Refusal};
 use rtfarm_picture::Picture;
 use rtfarm_proto::Address;
-use tempfile::TempDir;
 use tokio::{net::UnixListener, sync::watch, task::spawn_blocking, time::Instant};
 use tokio_util::sync::CancellationToken;
 
@@ -29,11 +25,14 @@ use crate::{
     args::{PictureArgs, RenderArgs},
     children::{Children, Setup},
     console::Console,
+    coordinator::UPLOAD_SILENCE,
     failure::Failure,
     local,
     output::Output,
     pilot,
-    source::{SceneText, scene_folder},
+    private_folder::PrivateFolder,
+    scene_files::SceneFiles,
+    source::SceneText,
 };
 
 /// What there is to say about a finished render.
@@ -158,10 +157,10 @@ async fn place(
     stop: &CancellationToken,
 ) -> Result<Order, Failure> {
     let request = args.request(output.format());
-    let folder = scene_folder(&args.scene);
+    let files = SceneFiles::new(&args.scene);
     let (name, style) = (args.scene.name(), Console::drawing_style());
     let placing = spawn_blocking(move || {
-        let placed = request.place(&text, &|path: &str| fs::read(folder.join(Path::new(path))));
+        let placed = request.place(&text, &|name: &str| files.read(name));
         let mut report = draw_diagnostics(&name, &text, &placed.diagnostics, style);
         report.extend(placed.omitted.summary());
         text.ensure_unchanged().map(|()| (placed.order, report))
@@ -226,13 +225,14 @@ async fn render_with_workers(
     stop: &CancellationToken,
 ) -> Result<Summary, Failure> {
     let (sampling, transfer) = (order.settings.quality.sampling, order.transfer);
-    let folder = private_folder(&std::env::temp_dir())?;
+    let folder = PrivateFolder::new(&std::env::temp_dir())?;
     let socket = folder.path().join("socket");
     let listener = UnixListener::bind(&socket)
         .with_context(|| format!("cannot listen on {}", socket.display()))?;
     let coordinator = Coordinator::new(Config {
         version: VERSION.to_owned(),
         term: args.lease_seconds,
+        upload_silence: UPLOAD_SILENCE,
         scene_folder: folder.path().to_owned(),
         picture_folder: output.folder(),
     });
@@ -252,12 +252,12 @@ async fn render_with_workers(
         isa: args.isa.0,
         log_format: args.log_format,
     };
-    let mut children = Children::start(workers, &setup, console).context("cannot start workers")?;
+    let mut children = Children::start(workers, setup, console).context("cannot start workers")?;
 
     let rendered = tokio::select! {
         rendered = wait(&job, console) => rendered,
-        reason = children.watch(&coordinator) => {
-            Err(Failure::Other(anyhow!("all workers are dead; the last one: {reason}")))
+        reason = children.keep_up(&coordinator, args.patience) => {
+            Err(Failure::Other(anyhow!(reason)))
         }
         () = stop.cancelled() => Err(Failure::Interrupted),
     };
@@ -280,15 +280,6 @@ async fn render_with_workers(
     let progress = job.progress();
     let (size, tally) = (job.picture().size(), progress.borrow().tally);
     Ok(Summary { size, tally, sampling, transfer, rendering: written?, workers })
-}
-
-/// A folder that only this user can look into; it goes when the answer does.
-pub(crate) fn private_folder(parent: &Path) -> anyhow::Result<TempDir> {
-    tempfile::Builder::new()
-        .prefix("rtfarm-")
-        .permissions(fs::Permissions::from_mode(0o700))
-        .tempdir_in(parent)
-        .with_context(|| format!("cannot make a folder in {}", parent.display()))
 }
 
 /// Shows how far a job is until it ends.

@@ -2,7 +2,6 @@
 //! itself. Its picture at many samples stands for the truth.
 
 use std::{
-    fs,
     io::{self, Write},
     ops::ControlFlow,
 };
@@ -22,7 +21,8 @@ use crate::{
     args::{ReportArgs, SceneArgs},
     console::Console,
     failure::Failure,
-    source::{SceneText, scene_folder},
+    scene_files::SceneFiles,
+    source::SceneText,
 };
 
 pub(crate) async fn run(
@@ -63,12 +63,12 @@ async fn read(
     stop: &CancellationToken,
 ) -> Result<(PreparedScene<PreparedBytes>, Size), Failure> {
     let text = SceneText::read(scene, stop).await?;
-    let (name, folder) = (scene.name(), scene_folder(scene));
+    let (name, files) = (scene.name(), SceneFiles::new(scene));
     let style = Console::drawing_style();
     let reading = spawn_blocking({
         let name = name.clone();
         move || {
-            let reading = read_scene(&text, &|path: &str| fs::read(folder.join(path)));
+            let reading = read_scene(&text, &|name: &str| files.read(name));
             let report = draw_diagnostics(&name, &text, &reading.diagnostics, style);
             text.ensure_unchanged().map(|()| (reading.scene, report))
         }

@@ -4,7 +4,7 @@ use std::{
     collections::BTreeMap,
     fs::{self, File, Metadata},
     io::{self, Read},
-    path::{Path, PathBuf},
+    path::Path,
     time::SystemTime,
 };
 
@@ -14,7 +14,7 @@ use rtfarm_core::language::referenced_files;
 use tokio::task::spawn_blocking;
 use tokio_util::sync::CancellationToken;
 
-use crate::{args::SceneArgs, failure::Failure, output::folder_of};
+use crate::{args::SceneArgs, failure::Failure, scene_files::SceneFiles};
 
 /// From here on a copy would count.
 const LONG: u64 = 16 << 20;
@@ -99,16 +99,24 @@ impl std::ops::Deref for SceneText {
     }
 }
 
-/// Where the files are that a scene names: they are relative to its own.
-pub(crate) fn scene_folder(scene: &SceneArgs) -> PathBuf {
-    if scene.is_from_stdin() { ".".into() } else { folder_of(&scene.path) }
-}
-
-/// The files that a scene names, by the names that it has for them. One that cannot be read is
-/// left out: the coordinator will miss it where the scene names it.
-pub(crate) fn read_named_files(text: &[u8], folder: &Path) -> BTreeMap<String, Vec<u8>> {
-    let read = |name: String| Some((fs::read(folder.join(&name)).ok()?, name));
-    referenced_files(text).into_iter().filter_map(read).map(|(data, name)| (name, data)).collect()
+/// The files that a scene names, by the names that it has for them, each told before it is sent.
+/// One that may not or cannot be read is left out: the coordinator will miss it where the scene
+/// names it.
+pub(crate) fn read_named_files(text: &[u8], files: &SceneFiles) -> BTreeMap<String, Vec<u8>> {
+    let mut read = BTreeMap::new();
+    for name in referenced_files(text) {
+        if read.contains_key(&name) {
+            continue;
+        }
+        match files.read(&name) {
+            Ok(data) => {
+                tracing::info!(file = name, bytes = data.len(), "sending a file of the scene");
+                read.insert(name, data);
+            }
+            Err(error) => tracing::warn!(file = name, reason = %error, "not sent"),
+        }
+    }
+    read
 }
 
 #[cfg(test)]
@@ -129,10 +137,11 @@ mod tests {
         let materials =
             [material("a", "wood.png"), material("b", "wood.png"), material("c", "gone.png")];
         let mesh = "geometry\nmesh\n file teapot.obj\n material a\nendmesh\nendgeometry\n";
+        let files = SceneFiles::in_folder(folder.path().to_owned(), Vec::new());
         let text = format!("materials\n{}endmaterials\n{mesh}", materials.concat());
-        let files = read_named_files(text.as_bytes(), folder.path());
+        let read = read_named_files(text.as_bytes(), &files);
         let expected = ["teapot.obj", "wood.png"].map(|name| (name.to_owned(), name.into()));
-        assert_eq!(files, BTreeMap::from(expected));
+        assert_eq!(read, BTreeMap::from(expected));
     }
 
     #[test]

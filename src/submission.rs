@@ -123,6 +123,9 @@ impl fmt::Display for Trouble {
 /// The longest that a short question may wait for its answer.
 const DEADLINE: Duration = Duration::from_secs(15);
 
+/// A coordinator that listens forgets a job at once.
+const CANCEL_DEADLINE: Duration = Duration::from_secs(3);
+
 /// A scene may be large and take long to prepare.
 const SUBMIT_DEADLINE: Duration = Duration::from_secs(1800);
 
@@ -137,6 +140,7 @@ const CHUNK_DEADLINE: Duration = Duration::from_secs(30);
 pub(crate) struct Submission {
     /// What the scene is called in messages.
     scene: String,
+    coordinator: Address,
     stage: Stage,
     /// When what is being done must have come further.
     deadline: Option<Instant>,
@@ -164,9 +168,9 @@ enum Stage {
 
 impl Submission {
     /// A submission that begins to look for the coordinator.
-    pub(crate) fn new(scene: String, now: Instant) -> Self {
-        let mut submission =
-            Self { scene, stage: Stage::Ended, deadline: None, actions: VecDeque::new() };
+    pub(crate) fn new(scene: String, coordinator: Address, now: Instant) -> Self {
+        let (stage, actions) = (Stage::Ended, VecDeque::new());
+        let mut submission = Self { scene, coordinator, stage, deadline: None, actions };
         submission.enter(Stage::Connecting, Action::Connect, now + DEADLINE);
         submission
     }
@@ -265,9 +269,17 @@ impl Submission {
 
     /// Event: what is being done has failed.
     pub(crate) fn on_trouble(&mut self, trouble: Trouble, now: Instant) {
-        match self.stage {
-            Stage::Cancelling { .. } => self.end_as_cancelled(),
-            _ => self.give_up(Failure::Other(anyhow::Error::msg(trouble)), now),
+        match (&self.stage, trouble) {
+            (Stage::Cancelling { .. }, _) => self.end_as_cancelled(),
+            // The picture is not at fault: it stays where it is.
+            (Stage::Fetching { job, .. }, Trouble::File(reason)) => {
+                let (job, coordinator) = (*job, &self.coordinator);
+                self.end(Err(Failure::Other(anyhow!(
+                    "{reason}; the farm keeps the picture for a while: rtfarm image {job} \
+                     --coordinator {coordinator} -o FILE fetches it"
+                ))));
+            }
+            (_, trouble) => self.give_up(Failure::Other(anyhow::Error::msg(trouble)), now),
         }
     }
 
@@ -304,7 +316,7 @@ impl Submission {
     }
 
     fn cancel(&mut self, job: JobId, end: Result<Finished, Failure>, now: Instant) {
-        self.enter(Stage::Cancelling { end }, Action::Cancel(job), now + DEADLINE);
+        self.enter(Stage::Cancelling { end }, Action::Cancel(job), now + CANCEL_DEADLINE);
     }
 
     fn end_as_cancelled(&mut self) {
@@ -330,6 +342,10 @@ mod tests {
     #[expect(clippy::disallowed_methods, reason = "any instant will do")]
     fn start() -> Instant {
         Instant::now()
+    }
+
+    fn coordinator() -> Address {
+        Address::Tcp("host:1".to_owned())
     }
 
     fn size() -> Size {
@@ -360,7 +376,7 @@ mod tests {
     impl Bench {
         fn connecting() -> Self {
             let now = start();
-            Self { submission: Submission::new("scene.rt".to_owned(), now), now }
+            Self { submission: Submission::new("scene.rt".to_owned(), coordinator(), now), now }
         }
 
         fn submitting() -> Self {
@@ -518,7 +534,7 @@ mod tests {
         let mut bench = Bench::fetching();
         bench.submission.on_fetched(bench.now);
         bench.submission.on_stop(bench.now);
-        assert_eq!(bench.sleep(), DEADLINE);
+        assert_eq!(bench.sleep(), CANCEL_DEADLINE);
         let (_, end) = bench.actions();
         end.expect("an end").expect("a picture");
     }
@@ -540,7 +556,7 @@ mod tests {
             [(opening, DEADLINE), (Bench::fetching(), IMAGE_DEADLINE), (reading, CHUNK_DEADLINE)]
         {
             assert_eq!(bench.sleep(), deadline);
-            assert_eq!(bench.sleep(), DEADLINE, "nor for its farewell");
+            assert_eq!(bench.sleep(), CANCEL_DEADLINE, "nor for its farewell");
             bench.check_failed(&["Cancel(JobId(7))"], 1, message);
         }
     }
@@ -556,12 +572,16 @@ mod tests {
     }
 
     #[test]
-    fn a_full_disk_ends_the_job_with_the_reason() {
+    fn a_picture_that_cannot_be_written_stays_with_the_farm() {
         let mut bench = Bench::fetching();
         let reason = "cannot write out.png: No space left on device".to_owned();
+        bench.actions();
         bench.submission.on_trouble(Trouble::File(reason.clone()), bench.now);
-        bench.submission.on_cancelled();
-        bench.check_failed(&["Cancel(JobId(7))"], 1, &reason);
+        let message = format!(
+            "{reason}; the farm keeps the picture for a while: rtfarm image 7 --coordinator \
+             http://host:1 -o FILE fetches it"
+        );
+        bench.check_failed(&[], 1, &message);
     }
 
     #[test]

@@ -31,8 +31,10 @@ use crate::{
     console::{Bar, Console},
     failure::Failure,
     output::Output,
+    plain::plain,
     render::Summary,
-    source::{SceneText, read_named_files, scene_folder},
+    scene_files::SceneFiles,
+    source::{SceneText, read_named_files},
     submission::{
         Action, Finished, JobEnd, JobState, Submission, SubmitOutcome, Submitted, Trouble,
     },
@@ -47,7 +49,8 @@ pub(crate) async fn run(
     let mut output = args.picture.output().map_err(Failure::Input)?;
     output.check()?;
     let text = SceneText::read(&args.picture.scene, stop).await?;
-    let mut submission = Submission::new(args.picture.scene.name(), now());
+    let mut submission =
+        Submission::new(args.picture.scene.name(), args.coordinator.clone(), now());
     let mut shell = Shell {
         args: &args,
         output: &output,
@@ -155,11 +158,11 @@ impl Shell<'_> {
             Action::Submit => {
                 let order = self.order();
                 let (client, text) = (self.client(), self.text.take().expect("it is sent once"));
-                let (folder, name) =
-                    (scene_folder(&self.args.picture.scene), self.args.picture.scene.name());
+                let scene = &self.args.picture.scene;
+                let (scene_files, name) = (SceneFiles::new(scene), scene.name());
                 self.start(|reports| async move {
                     let files = spawn_blocking(move || {
-                        let files = read_named_files(&text, &folder);
+                        let files = read_named_files(&text, &scene_files);
                         text.ensure_unchanged().map(|()| (text, files))
                     });
                     let report = match files.await.expect("reading never panics") {
@@ -292,17 +295,20 @@ impl Shell<'_> {
 }
 
 fn failed(status: &Status) -> Report {
-    Report::Trouble(Trouble::Call(status.message().to_owned()))
+    Report::Trouble(Trouble::Call(plain(status.message())))
+}
+
+/// Reaches a coordinator.
+pub(crate) async fn reach(
+    address: &Address,
+) -> Result<JobsClient<Channel>, tonic::transport::Error> {
+    let client = JobsClient::new(address.connect().await?);
+    Ok(client.max_decoding_message_size(MESSAGE_BYTES).max_encoding_message_size(MESSAGE_BYTES))
 }
 
 async fn connect(address: Address, reports: mpsc::Sender<Report>) {
-    let channel = address.connect().await;
-    let report = match channel.map_err(anyhow::Error::from) {
-        Ok(channel) => Report::Connected(
-            JobsClient::new(channel)
-                .max_decoding_message_size(MESSAGE_BYTES)
-                .max_encoding_message_size(MESSAGE_BYTES),
-        ),
+    let report = match reach(&address).await.map_err(anyhow::Error::from) {
+        Ok(client) => Report::Connected(client),
         Err(error) => Report::Trouble(Trouble::Connect(address, format!("{error:#}"))),
     };
     let _ = reports.send(report).await;
@@ -408,20 +414,30 @@ fn write(
     reports: mpsc::Sender<Report>,
 ) -> JoinHandle<()> {
     spawn_blocking(move || {
-        let written = output.write(&stop, |file| {
-            let mut is_whole = false;
-            while let Some(chunk) = chunks.blocking_recv() {
-                is_whole = chunk.data.is_empty();
-                file.write_all(&chunk.data)?;
-            }
-            if is_whole { Ok(()) } else { Err(io::Error::other("the picture was cut short")) }
-        });
+        let written = write_chunks(&output, &stop, &mut chunks);
         let report = match written {
             Ok(()) => Report::Fetched,
             Err(error) => Report::Trouble(Trouble::File(format!("{error:#}"))),
         };
         // Nobody listens when the submission has gone on without the picture.
         let _ = reports.blocking_send(report);
+    })
+}
+
+/// Writes a picture's pieces as they come; an empty one is the last. Never call this on the async
+/// runtime.
+pub(crate) fn write_chunks(
+    output: &Output,
+    stop: &CancellationToken,
+    chunks: &mut mpsc::Receiver<wire::Chunk>,
+) -> anyhow::Result<()> {
+    output.write(stop, |file| {
+        let mut is_whole = false;
+        while let Some(chunk) = chunks.blocking_recv() {
+            is_whole = chunk.data.is_empty();
+            file.write_all(&chunk.data)?;
+        }
+        if is_whole { Ok(()) } else { Err(io::Error::other("the picture was cut short")) }
     })
 }
 
@@ -436,9 +452,9 @@ fn read_submitted(answer: wire::SubmitResponse) -> anyhow::Result<Submitted> {
             job: JobId(accepted.job),
             size: Size::try_from(accepted.frame.ok_or(WireError::Missing("frame"))?)?,
         },
-        submit_response::Outcome::Refused(reason) => SubmitOutcome::Refused(reason),
+        submit_response::Outcome::Refused(reason) => SubmitOutcome::Refused(plain(&reason)),
     };
-    Ok(Submitted { outcome, report: answer.report })
+    Ok(Submitted { outcome, report: plain(&answer.report) })
 }
 
 fn read_event(event: wire::Event) -> anyhow::Result<JobState> {
@@ -446,7 +462,7 @@ fn read_event(event: wire::Event) -> anyhow::Result<JobState> {
         Some(event::End::Finished(finished)) => {
             Some(JobEnd::Finished(std::time::Duration::try_from_secs_f64(finished.seconds)?))
         }
-        Some(event::End::Failed(reason)) => Some(JobEnd::Failed(reason)),
+        Some(event::End::Failed(reason)) => Some(JobEnd::Failed(plain(&reason))),
         None => None,
     };
     Ok(JobState {

@@ -7,10 +7,14 @@ use tokio_util::sync::CancellationToken;
 
 use crate::{args::WorkerArgs, failure::Failure};
 
-/// A local worker needs no more patience: its coordinator is there or dead.
-const LOCAL_PATIENCE: Duration = Duration::from_secs(2);
+/// A local worker dies with its coordinator, and waits for one that is merely suspended.
+const LOCAL_PATIENCE: Duration = Duration::from_secs(24 * 3600);
 
-pub(crate) async fn run(args: WorkerArgs, stop: &CancellationToken) -> Result<(), Failure> {
+pub(crate) async fn run(
+    args: WorkerArgs,
+    stop: &CancellationToken,
+    terminate: &CancellationToken,
+) -> Result<(), Failure> {
     if let Some(parent) = args.parent {
         die_with_parent(parent)?;
     }
@@ -22,7 +26,14 @@ pub(crate) async fn run(args: WorkerArgs, stop: &CancellationToken) -> Result<()
         coordinator: args.coordinator,
         version: args.claim_version,
     };
-    rtfarm_worker::run(config, stop.cancelled()).await?;
+    let grace = args.grace;
+    let shutdown = async {
+        stop.cancelled().await;
+        // A local worker's tiles are of no use to a parent that ends it.
+        if terminate.is_cancelled() && !is_local { grace } else { Duration::ZERO }
+    };
+    rtfarm_worker::run(config, shutdown).await?;
     // A local worker is stopped by its parent, which tells the user.
-    if stop.is_cancelled() && !is_local { Err(Failure::Interrupted) } else { Ok(()) }
+    let is_interrupted = stop.is_cancelled() && !terminate.is_cancelled() && !is_local;
+    if is_interrupted { Err(Failure::Interrupted) } else { Ok(()) }
 }

@@ -297,12 +297,15 @@ fn a_killed_and_a_stopped_worker_change_nothing() {
 }
 
 #[test]
-fn without_workers_a_render_fails_and_says_why() {
+fn workers_that_die_are_replaced_and_without_any_a_render_fails_and_says_why() {
     let place = Place::new();
     let args = [&["render", "scene.rt", "-o", "out.png", "--workers", "1"], &SLOW[..]].concat();
     let mut render = place.start("render.log", &args);
     poll(|| (render.tiles_done() >= 1).then_some(()));
-    kill_process(pid(render.workers()[0].1), Signal::KILL).unwrap();
+    for count in 0..4 {
+        let worker = poll(|| render.workers().get(count).copied());
+        kill_process(pid(worker.1), Signal::KILL).unwrap();
+    }
     assert_eq!(render.wait().code(), Some(1));
     let log = render.log();
     let last = log.lines().last().unwrap();
@@ -361,7 +364,7 @@ fn a_farm_over_tcp_gives_the_same_bytes() {
     check_refused(&place, &other, 1, "this worker is rtfarm 0.0.0");
 
     coordinator.signal(Signal::TERM);
-    assert_eq!(coordinator.wait().code(), Some(130), "{}", coordinator.log());
+    assert_eq!(coordinator.wait().code(), Some(0), "{}", coordinator.log());
     for worker in &mut workers {
         assert!(worker.wait().success(), "sent home: {}", worker.log());
     }
@@ -430,6 +433,22 @@ fn workers_die_with_a_killed_coordinator() {
     for (_, process) in workers {
         wait_for_end_of(process);
     }
+    assert!(fs::read_dir(place.path("tmp")).unwrap().count() > 0, "a folder is left");
+    place.render("next.png", &["--size", "16x16", "--workers", "1"]);
+    place.check_nothing_is_left();
+}
+
+#[test]
+fn a_worker_that_stays_stopped_is_replaced() {
+    let place = Place::new();
+    let args = [&["render", "scene.rt", "-o", "out.png", "--workers", "1"], &SLOW[..]].concat();
+    let mut render = place.start("render.log", &args);
+    poll(|| (render.tiles_done() >= 1).then_some(()));
+    kill_process(pid(render.workers()[0].1), Signal::STOP).unwrap();
+    poll(|| (render.workers().len() == 2).then_some(()));
+    render.signal(Signal::INT);
+    assert_eq!(render.wait().code(), Some(130));
+    place.check_nothing_is_left();
 }
 
 /// Checks that a command fails with one line that says `reason`, and changes nothing.
@@ -500,9 +519,17 @@ fn a_port_in_use_and_a_missing_coordinator_are_told() {
     place.check_nothing_is_left();
 }
 
-#[test]
-fn a_full_disk_is_told_at_once() {
-    let place = Place::new();
+/// A farm's coordinator, started, and its address.
+fn start_coordinator(place: &Place) -> (Process, String) {
+    let mut coordinator =
+        place.start("coordinator.log", &["coordinator", "--listen", "127.0.0.1:0"]);
+    let line = coordinator.read_line();
+    let url = line.trim().strip_prefix("listening on ").expect(&line).to_owned();
+    (coordinator, url)
+}
+
+/// Does `check` with a small disk at `disk` in the place; the disk is unmounted by the end.
+fn with_small_disk(place: &Place, check: impl FnOnce() + std::panic::UnwindSafe) {
     let disk = place.path("disk");
     fs::create_dir(&disk).unwrap();
     let mounted = Command::new("mount")
@@ -514,17 +541,125 @@ fn a_full_disk_is_told_at_once() {
         eprintln!("SKIPPED: only root can mount the small disk that this test fills");
         return;
     }
-    let check = std::panic::catch_unwind(|| {
+    let checked = std::panic::catch_unwind(check);
+    assert!(Command::new("umount").arg(&disk).status().unwrap().success());
+    checked.unwrap();
+}
+
+#[test]
+fn a_full_disk_is_told_at_once() {
+    let place = Place::new();
+    with_small_disk(&place, || {
         for workers in ["0", "2"] {
             let size = ["--size", "512x512", "--samples", "1", "--workers", workers];
             let args = [&["render", "scene.rt", "-o", "disk/out.png"], &size[..]].concat();
             check_refused(&place, &args, 1, "No space left on device");
         }
-        assert_eq!(fs::read_dir(&disk).unwrap().count(), 0);
+        assert_eq!(fs::read_dir(place.path("disk")).unwrap().count(), 0);
         place.check_nothing_is_left();
     });
-    assert!(Command::new("umount").arg(&disk).status().unwrap().success());
-    check.unwrap();
+}
+
+#[test]
+fn a_picture_for_which_there_is_no_room_is_fetched_again() {
+    let place = Place::new();
+    let (_coordinator, url) = start_coordinator(&place);
+    let _worker = place.start("worker.log", &["worker", "--threads", "1", "--coordinator", &url]);
+    let picture = ["--size", "256x256", "--samples", "1"];
+    with_small_disk(&place, || {
+        let args = ["submit", "scene.rt", "-o", "disk/out.exr", "--coordinator", &url];
+        let mut submit = place.start("submit.log", &[&args[..], &picture].concat());
+        assert_eq!(submit.wait().code(), Some(1));
+        let log = submit.log();
+        assert!(log.contains("No space left on device"), "{log}");
+        let told = log.split_once("rtfarm ").expect(&log).1.split_once(" -o").expect(&log).0;
+        let told: Vec<&str> = told.split(' ').collect();
+        let mut image = place.start("image.log", &[&told[..], &["-o", "out.exr"]].concat());
+        assert!(image.wait().success(), "{told:?}: {}", image.log());
+        let here = place.render("here.exr", &[&picture[..], &["--workers", "0"]].concat());
+        assert!(fs::read(place.path("out.exr")).unwrap() == here);
+    });
+}
+
+#[test]
+fn check_does_not_wait_for_a_pipe_that_a_scene_names() {
+    let place = Place::new();
+    let entry = "entry\n name m\n color 1 1 1\n texture pipe.png\nendentry\n";
+    fs::write(place.path("pipe.rt"), format!("materials\n{entry}endmaterials\n")).unwrap();
+    let made = Command::new("mkfifo").arg(place.path("pipe.png")).status().unwrap();
+    assert!(made.success());
+    let mut check = place.start("check.log", &["check", "pipe.rt"]);
+    assert_eq!(check.wait().code(), Some(2));
+    assert!(check.log().contains("it is no regular file"), "{}", check.log());
+}
+
+#[test]
+fn a_file_outside_of_the_scenes_folder_is_sent_only_if_it_is_allowed() {
+    let place = Place::new();
+    let (_coordinator, url) = start_coordinator(&place);
+    let _worker = place.start("worker.log", &["worker", "--threads", "1", "--coordinator", &url]);
+    fs::create_dir(place.path("deep")).unwrap();
+    let mesh = "geometry\nmesh\n file ../tetra.obj\n material red\nendmesh\nendgeometry\n";
+    fs::write(place.path("deep/scene.rt"), scene_text() + mesh).unwrap();
+    let obj = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n";
+    fs::write(place.path("tetra.obj"), obj).unwrap();
+    let args = ["deep/scene.rt", "-o", "out.png", "--size", "32x32", "--samples", "1"];
+    let allow = ["--allow-files", "."];
+    for command in [&["submit", "--coordinator", &url][..], &["render"]] {
+        let mut refused = place.start("refused.log", &[command, &args].concat());
+        assert_eq!(refused.wait().code(), Some(2), "{}", refused.log());
+        assert!(refused.log().contains("outside of the scene's folder"), "{}", refused.log());
+        let mut allowed = place.start("allowed.log", &[command, &args, &allow].concat());
+        assert!(allowed.wait().success(), "{}", allowed.log());
+        let is_told = |line: &str| line.contains("sending a file") && line.contains("tetra.obj");
+        assert_eq!(allowed.log().lines().any(is_told), command[0] == "submit");
+    }
+}
+
+#[test]
+fn a_reader_of_the_log_that_stands_still_stops_nothing() {
+    let place = Place::new();
+    let mut coordinator = Command::new(env!("CARGO_BIN_EXE_rtfarm"))
+        .args(["coordinator", "--listen", "127.0.0.1:0"])
+        .env("TMPDIR", place.path("tmp"))
+        // Every request is told, more than a pipe holds.
+        .env("RUST_LOG", "debug")
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
+        .spawn()
+        .unwrap();
+    let stdout = coordinator.stdout.take().map(BufReader::new);
+    let mut coordinator = Process { child: coordinator, stdout, log: place.path("none") };
+    let line = coordinator.read_line();
+    let url = line.trim().strip_prefix("listening on ").expect(&line);
+    let mut worker = place.start("worker.log", &["worker", "--threads", "1", "--coordinator", url]);
+    let picture = ["--size", "160x160", "--samples", "1", "--tile", "4"];
+    let args = ["submit", "scene.rt", "-o", "out.png", "--coordinator", url];
+    let mut submit = place.start("submit.log", &[&args[..], &picture].concat());
+    assert!(submit.wait().success(), "{}", submit.log());
+    coordinator.signal(Signal::TERM);
+    assert_eq!(coordinator.wait().code(), Some(0));
+    assert!(worker.wait().success(), "{}", worker.log());
+    place.check_nothing_is_left();
+}
+
+#[test]
+fn a_second_interruption_ends_a_submit_at_once() {
+    let place = Place::new();
+    let (coordinator, url) = start_coordinator(&place);
+    let args = ["submit", "scene.rt", "-o", "out.png", "--coordinator", &url];
+    let mut submit = place.start("submit.log", &args);
+    poll(|| coordinator.log().contains("job started").then_some(()));
+    coordinator.signal(Signal::STOP);
+    submit.signal(Signal::INT);
+    thread::sleep(Duration::from_millis(300));
+    assert!(submit.child.try_wait().unwrap().is_none(), "it tells the farm, which does not listen");
+    submit.signal(Signal::INT);
+    let second = std::time::Duration::from_secs(1);
+    thread::sleep(second);
+    let status = submit.child.try_wait().unwrap().expect("it has ended");
+    assert_eq!(status.code(), Some(130));
+    coordinator.signal(Signal::CONT);
 }
 
 #[test]

@@ -283,8 +283,10 @@ fn paths_are_read_with_their_braces() {
 }
 
 /// The coordinator's files, each of which knows earlier ones only.
-const COORDINATOR: [&str; 10] =
-    ["tiles", "lease", "members", "waiting", "farm", "store", "job", "shell", "service", "run"];
+const COORDINATOR: [&str; 11] = [
+    "tiles", "lease", "members", "waiting", "farm", "store", "job", "shell", "service", "accept",
+    "run",
+];
 
 #[test]
 fn files_of_the_coordinator_know_only_earlier_ones() {

@@ -8,8 +8,10 @@
 //!
 //! ```text
 //! tiles <- lease, members, waiting <- farm, store, job <- shell <- service <- run
+//! accept <- run
 //! ```
 
+mod accept;
 mod farm;
 mod job;
 mod lease;

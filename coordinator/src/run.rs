@@ -1,15 +1,25 @@
 //! The coordinator as a process part: its handle, and the loop that runs it.
 
-use std::{sync::Arc, time::Duration};
+use std::{
+    io,
+    sync::Arc,
+    task::{Context, Poll, ready},
+    time::Duration,
+};
 
 use rtfarm_job::Order;
 use rtfarm_proto::JobId;
-use tokio::net::{TcpListener, UnixListener};
-use tokio_stream::wrappers::{TcpListenerStream, UnixListenerStream};
+use tokio::{
+    io::{AsyncRead, AsyncWrite},
+    net::{TcpListener, UnixListener},
+    sync::mpsc,
+};
+use tokio_stream::wrappers::ReceiverStream;
 use tokio_util::sync::CancellationToken;
-use tonic::transport::server::Router;
+use tonic::transport::server::{Connected, Router};
 
 use crate::{
+    accept::{WAITING, accept_all},
     job::Job,
     service,
     shell::{Config, Shell, SubmitError},
@@ -85,13 +95,38 @@ async fn serve(
     listener: Listener,
     stop: CancellationToken,
 ) -> Result<(), tonic::transport::Error> {
-    let stop = stop.cancelled_owned();
     match listener {
         Listener::Unix(listener) => {
-            router.serve_with_incoming_shutdown(UnixListenerStream::new(listener), stop).await
+            let accept = |context: &mut Context<'_>| {
+                listener.poll_accept(context).map_ok(|(stream, _)| stream)
+            };
+            serve_accepted(router, accept, stop).await
         }
         Listener::Tcp(listener) => {
-            router.serve_with_incoming_shutdown(TcpListenerStream::new(listener), stop).await
+            let accept = |context: &mut Context<'_>| {
+                let accepted = ready!(listener.poll_accept(context));
+                // Messages are written whole: none gains by waiting for the next.
+                Poll::Ready(
+                    accepted.and_then(|(stream, _)| stream.set_nodelay(true).map(|()| stream)),
+                )
+            };
+            serve_accepted(router, accept, stop).await
         }
     }
+}
+
+async fn serve_accepted<S>(
+    router: Router,
+    accept: impl FnMut(&mut Context<'_>) -> Poll<io::Result<S>>,
+    stop: CancellationToken,
+) -> Result<(), tonic::transport::Error>
+where
+    S: AsyncRead + AsyncWrite + Connected + Unpin + Send + 'static,
+{
+    let (send, connections) = mpsc::channel(WAITING);
+    let connections = ReceiverStream::new(connections);
+    let serve = router.serve_with_incoming_shutdown(connections, stop.cancelled_owned());
+    // Accepting ends when nobody takes connections any more.
+    let (served, ()) = tokio::join!(serve, accept_all(accept, send));
+    served
 }

@@ -25,6 +25,7 @@ use rtfarm_proto::{
 };
 use tokio::sync::{mpsc, oneshot};
 use tokio_stream::{Stream, wrappers::ReceiverStream};
+use tokio_util::sync::CancellationToken;
 use tonic::{
     Request, Response, Status, Streaming,
     transport::{
@@ -199,11 +200,12 @@ impl jobs_server::Jobs for JobsService {
         &self,
         request: Request<Streaming<wire::SubmitRequest>>,
     ) -> Result<Response<wire::SubmitResponse>, Status> {
-        let Bundle { order, text, files } = receive(request.into_inner()).await?;
-        check_version("client", &order.version, order.protocol, &self.shell)?;
+        let Bundle { order, text, files } = receive(request.into_inner(), &self.shell).await?;
         let wanted = to_request(order).map_err(invalid)?;
         let shell = Arc::clone(&self.shell);
-        let (outcome, report) = blocking(move || {
+        let client_gone = CancellationToken::new();
+        let _here = client_gone.clone().drop_guard();
+        let (outcome, report, unclaimed) = blocking(move || {
             let resolve = |path: &str| {
                 files.get(path).cloned().ok_or_else(|| {
                     let reason = format!("`{path}` was not sent along with the scene");
@@ -214,9 +216,14 @@ impl jobs_server::Jobs for JobsService {
             let Placed { order, diagnostics, omitted } = wanted.place(&text, &resolve);
             let mut report = draw_diagnostics(&name, &text, &diagnostics, Style::Plain);
             report.extend(omitted.summary());
+            if client_gone.is_cancelled() {
+                return Err(Status::cancelled("the client is gone"));
+            }
             let job = order.and_then(|order| {
                 shell.submit(order).map_err(|error| Refusal::Other(error.to_string()))
             });
+            let job_id = job.as_ref().ok().map(|job| job.id);
+            let unclaimed = job_id.map(|job| Unclaimed { shell, job: Some(job) });
             let outcome = match job {
                 Ok(job) => submit_response::Outcome::Accepted(wire::Accepted {
                     job: job.id.0,
@@ -226,9 +233,12 @@ impl jobs_server::Jobs for JobsService {
                 Err(Refusal::Scene) => submit_response::Outcome::Refused(String::new()),
                 Err(Refusal::Other(reason)) => submit_response::Outcome::Refused(reason),
             };
-            Ok((outcome, report))
+            Ok((outcome, report, unclaimed))
         })
         .await?;
+        if let Some(mut unclaimed) = unclaimed {
+            unclaimed.job = None;
+        }
         Ok(Response::new(wire::SubmitResponse { outcome: Some(outcome), report }))
     }
 
@@ -302,6 +312,21 @@ impl JobsService {
     }
 }
 
+/// A job that no client knows of yet. It is cancelled when this is dropped, as it is with the answer
+/// that nobody waits for any more.
+struct Unclaimed {
+    shell: Arc<Shell>,
+    job: Option<JobId>,
+}
+
+impl Drop for Unclaimed {
+    fn drop(&mut self) {
+        if let Some(job) = self.job {
+            self.shell.cancel(job);
+        }
+    }
+}
+
 /// A scene as a client sends it: its text and the files that it names.
 struct Bundle {
     order: wire::Order,
@@ -309,12 +334,21 @@ struct Bundle {
     files: HashMap<String, Vec<u8>>,
 }
 
-async fn receive(mut parts: Streaming<wire::SubmitRequest>) -> Result<Bundle, Status> {
-    let (mut order, mut text, mut files) = (None, Vec::new(), HashMap::<String, Vec<u8>>::new());
+async fn receive(parts: Streaming<wire::SubmitRequest>, shell: &Shell) -> Result<Bundle, Status> {
+    let mut parts = Upload { parts, silence: shell.config.upload_silence };
+    // What is not wanted is refused before it is sent.
+    let Some(submit_request::Part::Order(order)) = parts.next().await?.and_then(|part| part.part)
+    else {
+        return Err(invalid(WireError::Missing("order")));
+    };
+    check_version("client", &order.version, order.protocol, shell)?;
+    let (mut text, mut files) = (Vec::new(), HashMap::<String, Vec<u8>>::new());
     let mut byte_count = 0;
-    while let Some(part) = parts.message().await? {
+    while let Some(part) = parts.next().await? {
         match part.part {
-            Some(submit_request::Part::Order(first)) => order = Some(first),
+            Some(submit_request::Part::Order(_)) => {
+                return Err(Status::invalid_argument("a scene has one order"));
+            }
             Some(submit_request::Part::Text(piece)) => {
                 byte_count += piece.len();
                 text.extend_from_slice(&piece);
@@ -329,8 +363,26 @@ async fn receive(mut parts: Streaming<wire::SubmitRequest>) -> Result<Bundle, St
             return Err(Status::resource_exhausted("the scene and its files are too long"));
         }
     }
-    let order = order.ok_or_else(|| invalid(WireError::Missing("order")))?;
     Ok(Bundle { order, text, files })
+}
+
+/// What a client sends, piece by piece.
+struct Upload {
+    parts: Streaming<wire::SubmitRequest>,
+    /// The longest that a piece may be on its way.
+    silence: Duration,
+}
+
+impl Upload {
+    /// The next piece; `None` after the last.
+    async fn next(&mut self) -> Result<Option<wire::SubmitRequest>, Status> {
+        let next = tokio::time::timeout(self.silence, self.parts.message()).await;
+        next.unwrap_or_else(|_| {
+            let seconds = self.silence.as_secs_f64();
+            let reason = format!("nothing of the scene has come for {seconds:.1} s");
+            Err(Status::deadline_exceeded(reason))
+        })
+    }
 }
 
 fn to_request(order: wire::Order) -> Result<RenderRequest, WireError> {

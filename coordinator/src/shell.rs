@@ -36,6 +36,8 @@ pub struct Config {
     pub version: String,
     /// How long a lease lives without progress.
     pub term: Duration,
+    /// A client that sends nothing of its scene for this long is given up.
+    pub upload_silence: Duration,
     /// For prepared scenes: a folder that is nobody else's.
     pub scene_folder: PathBuf,
     /// For pictures while they are rendered.

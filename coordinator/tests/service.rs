@@ -39,6 +39,7 @@ impl Farm {
         let coordinator = Coordinator::new(Config {
             version: VERSION.to_owned(),
             term: Duration::from_millis(300),
+            upload_silence: Duration::from_millis(600),
             scene_folder: folder.path().to_owned(),
             picture_folder: folder.path().to_owned(),
         });
@@ -48,20 +49,7 @@ impl Farm {
         let channel = address.connect().await.unwrap();
         let (mut tiles, mut jobs) = (FarmClient::new(channel.clone()), JobsClient::new(channel));
         let worker = tiles.join(join(VERSION)).await.unwrap().into_inner().worker;
-        let order = wire::Order {
-            version: VERSION.to_owned(),
-            protocol: PROTOCOL,
-            name: "test".to_owned(),
-            frame: Some(wire::Frame { width: 16, height: 8 }),
-            quality: Some(
-                Quality { sampling: Sampling::fixed(1).unwrap(), ..Quality::default() }.into(),
-            ),
-            tile_side: 8,
-            format: wire::Format::Png8.into(),
-            transfer: wire::Transfer::None.into(),
-            ..wire::Order::default()
-        };
-        let parts = [Part::Order(order), Part::Text(SCENE.into())]
+        let parts = [Part::Order(order(VERSION)), Part::Text(SCENE.into())]
             .map(|part| wire::SubmitRequest { part: Some(part) });
         let answer = jobs.submit(tokio_stream::iter(parts)).await.unwrap().into_inner();
         let Some(Outcome::Accepted(accepted)) = answer.outcome else { panic!("{answer:?}") };
@@ -113,6 +101,22 @@ impl Farm {
         let request = wire::WatchRequest { job: self.job };
         let mut events = self.jobs.watch(request).await.unwrap().into_inner();
         events.message().await.unwrap().unwrap()
+    }
+}
+
+fn order(version: &str) -> wire::Order {
+    wire::Order {
+        version: version.to_owned(),
+        protocol: PROTOCOL,
+        name: "test".to_owned(),
+        frame: Some(wire::Frame { width: 16, height: 8 }),
+        quality: Some(
+            Quality { sampling: Sampling::fixed(1).unwrap(), ..Quality::default() }.into(),
+        ),
+        tile_side: 8,
+        format: wire::Format::Png8.into(),
+        transfer: wire::Transfer::None.into(),
+        ..wire::Order::default()
     }
 }
 
@@ -189,4 +193,79 @@ async fn strangers_are_told_what_is_wrong() {
     assert_eq!(farm.jobs.watch(request).await.unwrap_err().code(), Code::NotFound);
     let request = wire::ImageRequest { job: farm.job };
     assert_eq!(farm.jobs.image(request).await.unwrap_err().code(), Code::FailedPrecondition);
+}
+
+/// A scene that takes a while to prepare.
+fn long_scene() -> String {
+    let triangle = |k: u32| {
+        let (x, y) = (f64::from(k % 300) / 300.0, f64::from(k / 300) / 300.0);
+        let (right, up) = (x + 0.003, y + 0.003);
+        format!(
+            "triangle\nvertex {x} {y} 1\nvertex {right} {y} 1\nvertex {x} {up} 1\n\
+            material m\nendtriangle\n"
+        )
+    };
+    let triangles: String = (0..90_000).map(triangle).collect();
+    let materials = "materials\nentry\nname m\ncolor 1 2 3\nendentry\nendmaterials\n";
+    format!("{SCENE}{materials}geometry\n{triangles}endgeometry\n")
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_client_that_goes_while_its_scene_is_prepared_leaves_no_job() {
+    let mut farm = Farm::new().await;
+    for _ in 0..2 {
+        let (lease, tiles) = farm.lease().await;
+        for tile in tiles {
+            farm.deliver(lease, tile, 0.5).await.unwrap();
+        }
+        if farm.state().await.end.is_some() {
+            break;
+        }
+    }
+    let (send, receive) = tokio::sync::mpsc::channel(1);
+    let mut jobs = farm.jobs.clone();
+    let stream = tokio_stream::wrappers::ReceiverStream::new(receive);
+    let submitting = tokio::spawn(async move { jobs.submit(stream).await });
+    let text = long_scene();
+    let pieces = text.as_bytes().chunks(1 << 20).map(|piece| Part::Text(piece.to_vec().into()));
+    for part in std::iter::once(Part::Order(order(VERSION))).chain(pieces) {
+        send.send(wire::SubmitRequest { part: Some(part) }).await.unwrap();
+    }
+    drop(send);
+    // The text is on its way and will have come before the end of the call does.
+    tokio::time::sleep(Duration::from_millis(30)).await;
+    assert!(!submitting.is_finished(), "the scene is being prepared");
+    submitting.abort();
+    let request = wire::LeaseRequest { worker: farm.worker, max_tiles: 64, wait_ms: 5000 };
+    let next = farm.tiles.lease(request).await.unwrap().into_inner().next;
+    assert!(matches!(next, Some(Next::Nothing(_))), "{next:?}");
+}
+
+/// Begins to submit and goes on no further than the order.
+async fn begin_to_submit(farm: &Farm, version: &str) -> tokio::task::JoinHandle<Code> {
+    let (send, receive) = tokio::sync::mpsc::channel(1);
+    send.send(wire::SubmitRequest { part: Some(Part::Order(order(version))) }).await.unwrap();
+    let mut jobs = farm.jobs.clone();
+    let stream = tokio_stream::wrappers::ReceiverStream::new(receive);
+    tokio::spawn(async move {
+        let code = jobs.submit(stream).await.unwrap_err().code();
+        drop(send);
+        code
+    })
+}
+
+#[tokio::test]
+async fn a_client_of_another_version_is_refused_before_it_sends_its_scene() {
+    let farm = Farm::new().await;
+    let refused = begin_to_submit(&farm, "1.2.4").await;
+    let refused = tokio::time::timeout(Duration::from_secs(10), refused).await;
+    assert_eq!(refused.expect("an answer before the end").unwrap(), Code::FailedPrecondition);
+}
+
+#[tokio::test]
+async fn an_upload_that_stands_still_is_dropped() {
+    let farm = Farm::new().await;
+    let dropped = begin_to_submit(&farm, VERSION).await;
+    let dropped = tokio::time::timeout(Duration::from_secs(10), dropped).await;
+    assert_eq!(dropped.expect("it is dropped").unwrap(), Code::DeadlineExceeded);
 }

@@ -16,7 +16,6 @@ pub struct Config {
     pub isa: Isa,
     /// The version of the package; the coordinator must have the same.
     pub version: String,
-    /// How long it goes on without a coordinator: the pauses between the attempts of one call
-    /// add up to no more.
+    /// How long it goes on without a coordinator, from the first failure on.
     pub patience: Duration,
 }

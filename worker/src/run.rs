@@ -16,7 +16,7 @@ use std::{
 use rayon::{ThreadPool, ThreadPoolBuilder};
 use rtfarm_core::{prepared::SceneHash, render::render_tile, tile::TileId};
 use rtfarm_proto::{
-    LeaseName, pixels_to_bytes,
+    Address, LeaseName, pixels_to_bytes,
     wire::{self, farm_client::FarmClient},
 };
 use tokio::{
@@ -38,8 +38,12 @@ use crate::{
     worker::Worker,
 };
 
-/// Works for the coordinator until that sends it home or `shutdown` comes.
-pub async fn run(config: Config, shutdown: impl Future<Output = ()>) -> Result<(), WorkerError> {
+/// Works for the coordinator until that sends it home or `shutdown` comes, which says how long the
+/// tiles in hand may still take.
+pub async fn run(
+    config: Config,
+    shutdown: impl Future<Output = Duration>,
+) -> Result<(), WorkerError> {
     let nonce = random()?;
     let mut worker = Worker::new(&config, nonce, now());
     let mut shell = Shell::new(config, nonce)?;
@@ -59,9 +63,9 @@ pub async fn run(config: Config, shutdown: impl Future<Output = ()>) -> Result<(
             }
             Some(()) = shell.beats.recv() => worker.on_beat(now()),
             () = sleep_until(worker.wake_at()) => worker.on_tick(now()),
-            () = &mut shutdown, if !is_stopped => {
+            grace = &mut shutdown, if !is_stopped => {
                 is_stopped = true;
-                worker.on_stop(now());
+                worker.on_stop(grace, now());
             }
         }
     }
@@ -187,8 +191,9 @@ impl Shell {
     fn fetch(&mut self, task: TaskId, job: Arc<Job>, silence: Duration) {
         let client = self.client.clone().expect("a worker connects before it fetches");
         let (scene, pulse) = (job.scene, Arc::clone(&self.pulse));
+        let is_local = matches!(self.config.coordinator, Address::Unix(_));
         self.start(task, async move {
-            match load(job, silence, client, pulse).await {
+            match load(job, is_local, silence, client, pulse).await {
                 Ok(loaded) => Report::Fetched(scene, loaded),
                 Err(error) => Report::FetchFailed(error),
             }

@@ -3,13 +3,16 @@
 use std::{
     fs::File,
     io::{self, Write},
+    os::unix::fs::OpenOptionsExt,
+    path::Path,
     sync::Arc,
     time::Duration,
 };
 
 use rtfarm_core::prepared::{PreparedError, PreparedScene};
 use rtfarm_proto::wire::{self, farm_client::FarmClient};
-use tonic::{Status, transport::Channel};
+use rustix::fs::OFlags;
+use tonic::{Code, Status, transport::Channel};
 
 use crate::{job::Job, map::Map, pulse::Pulse};
 
@@ -21,6 +24,10 @@ pub enum SceneError {
     /// A file on this machine fails.
     #[error("cannot read the prepared scene: {0}")]
     Io(#[from] io::Error),
+    /// The scene is not there any more, or its coordinator is not: the job may have been cancelled
+    /// since its tiles were leased.
+    #[error("the prepared scene is gone: {0}")]
+    Gone(String),
     /// The coordinator does not send the scene.
     #[error("cannot fetch the prepared scene: {0}")]
     Fetch(String),
@@ -34,24 +41,51 @@ pub enum SceneError {
 
 impl From<Status> for SceneError {
     fn from(status: Status) -> Self {
-        Self::Fetch(status.message().to_owned())
+        let reason = status.message().to_owned();
+        match status.code() {
+            Code::NotFound
+            | Code::Unavailable
+            | Code::DeadlineExceeded
+            | Code::Unknown
+            | Code::Cancelled => Self::Gone(reason),
+            _ => Self::Fetch(reason),
+        }
     }
 }
 
 /// Brings a job's scene into memory. Every sign of progress beats `pulse`; no piece of the scene
-/// may take the coordinator longer than `silence`.
+/// may take the coordinator longer than `silence`. Only a coordinator that is certainly on this
+/// machine, `is_local`, can know where the scene is here.
 pub(crate) async fn load(
     job: Arc<Job>,
+    is_local: bool,
     silence: Duration,
     client: FarmClient<Channel>,
     pulse: Arc<Pulse>,
 ) -> Result<Arc<Scene>, SceneError> {
     let file = match &job.scene_path {
-        Some(path) => File::open(path)?,
-        None => fetch(&job, silence, client, &pulse).await?,
+        Some(path) if is_local => find(path)?,
+        _ => fetch(&job, silence, client, &pulse).await?,
     };
     let opened = tokio::task::spawn_blocking(move || open(&file, &job, &pulse)).await;
     opened.map_err(io::Error::other)?
+}
+
+/// Opens a scene's file. Nothing else is opened in its place, nor waited for.
+fn find(path: &Path) -> Result<File, SceneError> {
+    let file = File::options()
+        .read(true)
+        .custom_flags(OFlags::NONBLOCK.bits().cast_signed())
+        .open(path)
+        .map_err(|error| match error.kind() {
+            io::ErrorKind::NotFound => SceneError::Gone(error.to_string()),
+            _ => SceneError::Io(error),
+        })?;
+    if file.metadata()?.is_file() {
+        Ok(file)
+    } else {
+        Err(io::Error::other("it is no regular file").into())
+    }
 }
 
 async fn fetch(
@@ -63,7 +97,7 @@ async fn fetch(
     // The file has no name, so that nothing stays behind.
     let mut file = tempfile::tempfile()?;
     let request = wire::FetchRequest { scene_hash: job.scene.0.to_vec().into() };
-    let late = |_| SceneError::Fetch("the coordinator was silent for too long".to_owned());
+    let late = |_| SceneError::Gone("the coordinator was silent for too long".to_owned());
     let fetched = tokio::time::timeout(silence, client.fetch(request));
     let mut chunks = fetched.await.map_err(late)??.into_inner();
     let mut byte_count = 0;
@@ -87,4 +121,50 @@ fn open(file: &File, job: &Job, pulse: &Pulse) -> Result<Arc<Scene>, SceneError>
     }
     pulse.beat();
     Ok(Arc::new(scene))
+}
+
+#[cfg(test)]
+mod tests {
+    use rtfarm_core::{
+        prepared::SceneHash,
+        render::{Quality, Settings},
+        tile::{Size, TileGrid},
+    };
+    use rtfarm_proto::Address;
+    use rustix::fs::{CWD, FileType, Mode, mknodat};
+    use tonic::transport::Endpoint;
+
+    use super::*;
+
+    /// What comes of a job whose scene is said to be at `path`, with a coordinator that is gone.
+    async fn load_from(path: &Path, is_local: bool) -> Result<Arc<Scene>, SceneError> {
+        let size = Size::new(16, 16).unwrap();
+        let job = Job {
+            scene: SceneHash([0; 32]),
+            scene_byte_count: 1,
+            scene_path: Some(path.into()),
+            settings: Settings { size, quality: Quality::default() },
+            grid: TileGrid::new(size, 16).unwrap(),
+        };
+        let nowhere = Address::Tcp("127.0.0.1:1".to_owned()).to_string();
+        let client = FarmClient::new(Endpoint::from_shared(nowhere).unwrap().connect_lazy());
+        let (pulse, _beats) = Pulse::new(Duration::ZERO);
+        load(Arc::new(job), is_local, Duration::from_secs(20), client, Arc::new(pulse)).await
+    }
+
+    #[tokio::test]
+    async fn what_is_no_regular_file_is_not_waited_for() {
+        let folder = tempfile::tempdir().unwrap();
+        let pipe = folder.path().join("pipe");
+        mknodat(CWD, &pipe, FileType::Fifo, Mode::RUSR | Mode::WUSR, 0).unwrap();
+        let error = load_from(&pipe, true).await.unwrap_err();
+        assert!(error.to_string().contains("it is no regular file"), "{error}");
+    }
+
+    #[tokio::test]
+    async fn a_coordinator_elsewhere_cannot_name_a_file_here() {
+        let file = tempfile::NamedTempFile::new().unwrap();
+        let error = load_from(file.path(), false).await.unwrap_err();
+        assert!(matches!(error, SceneError::Gone(_)), "it is asked for the scene: {error}");
+    }
 }

@@ -44,19 +44,22 @@ pub(crate) enum Action {
 /// The delays between the attempts of one call.
 type Backoff = <ExponentialBuilder as BackoffBuilder>::Backoff;
 
+/// A call, and what is left to try.
+#[derive(Debug)]
+struct Attempts {
+    call: Call,
+    backoff: Backoff,
+}
+
 #[derive(Debug)]
 enum Task {
     /// Waits for its answer until `deadline`.
     Asked {
-        call: Call,
-        backoff: Backoff,
+        attempts: Attempts,
         deadline: Instant,
     },
     /// Failed, and waits for its timer to be asked again.
-    Failed {
-        call: Call,
-        backoff: Backoff,
-    },
+    Failed(Attempts),
     Fetch,
     Render(LeaseName),
 }
@@ -66,6 +69,8 @@ enum Task {
 #[derive(Debug)]
 pub(crate) struct Tasks {
     patience: Duration,
+    /// When a call first failed for want of an answer, if none was answered since.
+    silent_since: Option<Instant>,
     seed: u64,
     begun: BTreeMap<TaskId, Task>,
     begun_count: u64,
@@ -82,10 +87,12 @@ pub(crate) struct GivenUp {
 
 impl Tasks {
     /// Nothing is under way. Calls that fail for want of an answer are repeated with growing
-    /// delays, which `seed` shuffles, until these would add up to more than `patience`.
+    /// delays, which `seed` shuffles, until these would add up to more than `patience`, or the
+    /// first failure since the last answer to any call is so long ago.
     pub(crate) fn new(patience: Duration, seed: u64) -> Self {
         Self {
             patience,
+            silent_since: None,
             seed,
             begun: BTreeMap::new(),
             begun_count: 0,
@@ -117,14 +124,20 @@ impl Tasks {
             .with_total_delay(Some(self.patience))
             .without_max_times()
             .build();
-        self.ask(call, backoff, now);
+        self.ask(Attempts { call, backoff }, now);
     }
 
-    fn ask(&mut self, call: Call, backoff: Backoff, now: Instant) {
-        let deadline = now + call.deadline();
-        self.actions.push_back(Action::Call(TaskId(self.begun_count), call.clone()));
-        let task = self.begin(Task::Asked { call, backoff, deadline });
+    fn ask(&mut self, attempts: Attempts, now: Instant) {
+        let deadline = now + attempts.call.deadline();
+        let deadline = self.give_up_at().map_or(deadline, |end| end.min(deadline));
+        self.actions.push_back(Action::Call(TaskId(self.begun_count), attempts.call.clone()));
+        let task = self.begin(Task::Asked { attempts, deadline });
         self.timers.insert((deadline, task));
+    }
+
+    /// When nothing is waited for any more unless there is an answer.
+    fn give_up_at(&self) -> Option<Instant> {
+        self.silent_since.map(|since| since + self.patience)
     }
 
     /// Begins to bring a scene into memory.
@@ -148,14 +161,16 @@ impl Tasks {
 
     /// Event: a call was answered. `None` when nobody waits for it.
     pub(crate) fn on_answer(&mut self, task: TaskId) -> Option<Call> {
-        self.take_asked(task).map(|(call, _)| call)
+        let attempts = self.take_asked(task)?;
+        self.silent_since = None;
+        Some(attempts.call)
     }
 
-    fn take_asked(&mut self, task: TaskId) -> Option<(Call, Backoff)> {
+    fn take_asked(&mut self, task: TaskId) -> Option<Attempts> {
         match self.begun.remove(&task)? {
-            Task::Asked { call, backoff, deadline } => {
+            Task::Asked { attempts, deadline } => {
                 self.timers.remove(&(deadline, task));
-                Some((call, backoff))
+                Some(attempts)
             }
             other => {
                 self.begun.insert(task, other);
@@ -177,21 +192,27 @@ impl Tasks {
         error: CallError,
         now: Instant,
     ) -> Option<GivenUp> {
-        let (call, mut backoff) = self.take_asked(task)?;
-        let may_repeat = match call {
+        let mut attempts = self.take_asked(task)?;
+        if error.kind == CallErrorKind::NoAnswer {
+            self.silent_since.get_or_insert(now);
+        }
+        let give_up_at = self.give_up_at();
+        let may_repeat = match attempts.call {
             // Whatever the reason is, a coordinator may be there a moment later.
             Call::Connect => true,
             Call::Leave { .. } => false,
             _ => error.kind == CallErrorKind::NoAnswer,
         };
-        match backoff.next().filter(|_| may_repeat) {
+        let delay =
+            attempts.backoff.next().filter(|&delay| give_up_at.is_none_or(|end| now + delay < end));
+        match delay.filter(|_| may_repeat) {
             Some(delay) => {
                 tracing::debug!(reason = error.message, ?delay, "asking again");
-                let task = self.begin(Task::Failed { call, backoff });
+                let task = self.begin(Task::Failed(attempts));
                 self.timers.insert((now + delay, task));
                 None
             }
-            None => Some(GivenUp { call, error }),
+            None => Some(GivenUp { call: attempts.call, error }),
         }
     }
 
@@ -210,8 +231,8 @@ impl Tasks {
                 }
             } else {
                 self.timers.remove(&(at, task));
-                if let Some(Task::Failed { call, backoff }) = self.begun.remove(&task) {
-                    self.ask(call, backoff, now);
+                if let Some(Task::Failed(attempts)) = self.begun.remove(&task) {
+                    self.ask(attempts, now);
                 }
             }
         }
@@ -228,8 +249,9 @@ impl Tasks {
     /// Stops everything; nobody waits for any report any more.
     pub(crate) fn stop_all(&mut self) {
         self.timers.clear();
+        self.silent_since = None;
         for (task, stopped) in std::mem::take(&mut self.begun) {
-            if !matches!(stopped, Task::Failed { .. }) {
+            if !matches!(stopped, Task::Failed(_)) {
                 self.actions.push_back(Action::Stop(task));
             }
         }

@@ -49,6 +49,8 @@ pub(crate) struct Worker {
     threads: usize,
     tasks: Tasks,
     stage: Stage,
+    /// Set when this worker only finishes what its threads have in hand: until when it may.
+    drain_until: Option<Instant>,
 }
 
 #[derive(Debug)]
@@ -105,6 +107,7 @@ impl Worker {
             threads: config.threads,
             tasks,
             stage: Stage::Joining,
+            drain_until: None,
         }
     }
 
@@ -115,7 +118,7 @@ impl Worker {
 
     /// When to call [`Worker::on_tick`] if nothing happens before.
     pub(crate) fn wake_at(&self) -> Option<Instant> {
-        self.tasks.wake_at()
+        [self.tasks.wake_at(), self.drain_until].into_iter().flatten().min()
     }
 
     /// Event: the coordinator has answered a call.
@@ -171,8 +174,18 @@ impl Worker {
 
     /// Event: a scene cannot be brought into memory.
     pub(crate) fn on_fetch_failed(&mut self, task: TaskId, error: SceneError, now: Instant) {
-        if self.tasks.on_end(task) {
-            self.leave(Err(error.into()), now);
+        if !self.tasks.on_end(task) {
+            return;
+        }
+        match (&mut self.stage, error) {
+            (Stage::Working(member), SceneError::Gone(reason)) => {
+                tracing::info!(worker = member.id.0, reason, "dropped a lease");
+                if let Some(run) = member.fetching.take() {
+                    member.leases.remove(&run.lease);
+                }
+                self.proceed(now);
+            }
+            (_, error) => self.leave(Err(error.into()), now),
         }
     }
 
@@ -202,13 +215,22 @@ impl Worker {
         while let Some(given_up) = self.tasks.on_tick(now) {
             self.on_given_up(given_up, now);
         }
+        if self.drain_until.is_some_and(|until| until <= now) {
+            self.leave(Ok(()), now);
+        }
     }
 
-    /// Event: somebody wants this worker to end.
-    pub(crate) fn on_stop(&mut self, now: Instant) {
-        match self.stage {
+    /// Event: somebody wants this worker to end. The tiles that its threads have in hand may still
+    /// be finished and delivered for as long as `grace`.
+    pub(crate) fn on_stop(&mut self, grace: Duration, now: Instant) {
+        match &mut self.stage {
             Stage::Joining => self.end(Ok(())),
-            Stage::Working(_) => self.leave(Ok(()), now),
+            Stage::Working(_) if grace.is_zero() => self.leave(Ok(()), now),
+            Stage::Working(member) => {
+                member.waiting.clear();
+                self.drain_until = Some(now + grace);
+                self.proceed(now);
+            }
             Stage::Leaving(_) | Stage::Ended => {}
         }
     }
@@ -239,6 +261,9 @@ impl Worker {
                 self.tasks.push(Action::ForgetScene(scene));
             }
         }
+        if self.drain_until.is_some() {
+            return self.end(Ok(()));
+        }
         self.tasks.call(Call::Join, now);
     }
 
@@ -252,6 +277,7 @@ impl Worker {
         let leave = Call::Leave { worker: member.id, reason };
         self.tasks.stop_all();
         self.tasks.call(leave, now);
+        self.drain_until = None;
         self.stage = Stage::Leaving(exit);
     }
 
@@ -264,12 +290,17 @@ impl Worker {
     fn end(&mut self, exit: Result<(), WorkerError>) {
         self.tasks.stop_all();
         self.tasks.push(Action::Exit(exit));
+        self.drain_until = None;
         self.stage = Stage::Ended;
     }
 
     fn proceed(&mut self, now: Instant) {
         if let Stage::Working(member) = &mut self.stage {
-            member.proceed(&mut self.tasks, now);
+            let is_draining = self.drain_until.is_some();
+            member.proceed(is_draining, &mut self.tasks, now);
+            if is_draining && member.holds_no_pixels() {
+                self.leave(Ok(()), now);
+            }
         }
     }
 }
@@ -331,14 +362,17 @@ impl Member {
         }
     }
 
-    /// Begins whatever can be begun now.
-    fn proceed(&mut self, tasks: &mut Tasks, now: Instant) {
+    /// Begins whatever can be begun now; when it `is_draining`, deliveries alone.
+    fn proceed(&mut self, is_draining: bool, tasks: &mut Tasks, now: Instant) {
         while self.delivering_count < TILES_AHEAD * self.threads
             && let Some(tile) = self.rendered.pop_front()
         {
             self.on_tile_sent(tile.lease);
             self.delivering_count += 1;
             tasks.call(Call::Deliver { worker: self.id, tile }, now);
+        }
+        if is_draining {
+            self.waiting.clear();
         }
         while self.has_room_for_pixels()
             && let Some(Waiting { lease, tile, job }) = self.waiting.pop_front()
@@ -350,7 +384,7 @@ impl Member {
 
         let tiles_left: usize = self.leases.values().sum();
         let is_short = tiles_left < TILES_AHEAD * self.threads;
-        if is_short && !self.is_leasing && self.fetching.is_none() {
+        if is_short && !is_draining && !self.is_leasing && self.fetching.is_none() {
             self.is_leasing = true;
             let most_tiles = LONGEST_RUN_A_THREAD * self.threads;
             tasks.call(Call::Lease { worker: self.id, most_tiles, wait: LONGEST_WAIT }, now);
@@ -361,6 +395,10 @@ impl Member {
             let leases = self.leases.keys().copied().collect();
             tasks.call(Call::Renew { worker: self.id, leases }, now);
         }
+    }
+
+    fn holds_no_pixels(&self) -> bool {
+        self.rendering_count + self.rendered.len() + self.delivering_count == 0
     }
 
     fn has_room_for_pixels(&self) -> bool {

@@ -85,12 +85,16 @@ struct Bench {
 impl Bench {
     /// A worker that connects.
     fn new(threads: usize) -> Self {
+        Self::with_patience(threads, PATIENCE)
+    }
+
+    fn with_patience(threads: usize, patience: Duration) -> Self {
         let config = Config {
             coordinator: Address::Tcp("host:1".to_owned()),
             threads,
             isa: rtfarm_core::isa::Isa::fastest(),
             version: "1".to_owned(),
-            patience: PATIENCE,
+            patience,
         };
         let now = start();
         let mut bench = Self {
@@ -222,7 +226,7 @@ impl Bench {
     }
 
     fn stop(&mut self) {
-        self.worker.on_stop(self.now);
+        self.worker.on_stop(Duration::ZERO, self.now);
         self.absorb();
     }
 
@@ -403,6 +407,23 @@ fn an_unusable_scene_ends_the_worker() {
 }
 
 #[test]
+fn a_scene_that_is_gone_costs_its_lease_and_not_the_worker() {
+    let mut bench = Bench::joined(1);
+    bench.answer(is_lease, run(1, 9, 0));
+    let (task, _) = bench.fetches.pop_first().unwrap();
+    let gone = SceneError::Gone("no job has this scene now".to_owned());
+    bench.worker.on_fetch_failed(task, gone, bench.now);
+    bench.absorb();
+    assert_eq!(bench.exit, None);
+    bench.beat();
+    assert!(!bench.has(is_renew), "the lease is dropped");
+    bench.answer(is_lease, run(2, 1, 1));
+    bench.fetch();
+    assert_eq!(bench.render().0, lease(2));
+    assert!(bench.has(is_deliver), "it works on");
+}
+
+#[test]
 fn a_forgotten_worker_stops_everything_and_joins_again() {
     let mut bench = Bench::rendering(1, 9);
     bench.render();
@@ -448,16 +469,14 @@ fn a_coordinator_that_is_not_there_is_sought_as_long_as_patience_lasts() {
 #[test]
 fn a_silent_coordinator_is_asked_again_and_in_the_end_given_up() {
     let mut bench = Bench::joined(1);
-    let mut waited = Duration::ZERO;
+    let begun = bench.now;
+    bench.sleep();
+    let deadline = LONGEST_WAIT + Duration::from_secs(15);
+    assert_eq!(bench.now - begun, deadline);
     while bench.has(is_lease) || !bench.has(|_| true) {
-        let (asked, before) = (bench.has(is_lease), bench.now);
         bench.sleep();
-        if asked {
-            assert_eq!(bench.now - before, LONGEST_WAIT + Duration::from_secs(15));
-        } else {
-            waited += bench.now - before;
-        }
     }
+    let waited = bench.now - (begun + deadline);
     assert!(waited <= PATIENCE && waited + Duration::from_secs(4) > PATIENCE, "{waited:?}");
     let before = bench.now;
     bench.sleep();
@@ -551,6 +570,35 @@ fn a_worker_that_has_not_joined_stops_at_once() {
     let mut bench = Bench::new(1);
     bench.answer(|call| matches!(call, Call::Connect), Answer::Connected);
     bench.stop();
+    assert_eq!(bench.exit, Some(Ok(())));
+}
+
+#[test]
+fn a_worker_that_is_drained_delivers_what_its_threads_have_and_leaves() {
+    let mut bench = Bench::rendering(1, 9);
+    bench.worker.on_stop(Duration::from_secs(10), bench.now);
+    bench.absorb();
+    let mut count = 0;
+    while !bench.renderings.is_empty() {
+        bench.render();
+        count += 1;
+        bench.answer(is_deliver, Answer::Delivered);
+    }
+    assert_eq!(count, TILES_AT_HAND, "no tile is begun any more");
+    bench.answer(|call| matches!(call, Call::Leave { .. }), Answer::Left);
+    assert_eq!(bench.exit, Some(Ok(())));
+}
+
+#[test]
+fn a_worker_is_drained_no_longer_than_its_grace() {
+    let mut bench = Bench::rendering(1, 9);
+    let begun = bench.now;
+    bench.worker.on_stop(Duration::from_secs(1), bench.now);
+    bench.absorb();
+    bench.sleep();
+    assert_eq!(bench.now - begun, Duration::from_secs(1));
+    assert_eq!(bench.stopped.len(), bench.renderings.len());
+    bench.answer(|call| matches!(call, Call::Leave { .. }), Answer::Left);
     assert_eq!(bench.exit, Some(Ok(())));
 }
 
@@ -685,7 +733,8 @@ impl Chance {
 
 /// Plays a worker's life to its end.
 fn simulate(seed: u64) {
-    let mut bench = Bench::new(1 + (seed % 3) as usize);
+    // Some answers in a row are lost, each of which is waited for.
+    let mut bench = Bench::with_patience(1 + (seed % 3) as usize, 20 * PATIENCE);
     let tiles = (0..2).flat_map(|scene| grid().render_order().into_iter().map(move |t| (scene, t)));
     let mut chance = Chance {
         random: SplitMix64(seed),
