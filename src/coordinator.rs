@@ -35,7 +35,7 @@ pub(crate) async fn run(args: CoordinatorArgs, stop: &CancellationToken) -> Resu
         term: args.lease_seconds,
         scene_folder: folder.path().to_owned(),
         picture_folder: folder.path().to_owned(),
-    });
+    })?;
     coordinator.run(Listener::Tcp(listener), stop.cancelled()).await?;
     Err(Failure::Interrupted)
 }

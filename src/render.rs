@@ -235,7 +235,7 @@ async fn render_with_workers(
         term: args.lease_seconds,
         scene_folder: folder.path().to_owned(),
         picture_folder: output.folder(),
-    });
+    })?;
     let job = spawn_blocking({
         let coordinator = coordinator.clone();
         move || coordinator.submit(order)

@@ -9,9 +9,10 @@ use std::{
 
 use rtfarm_core::{render::Tally, tile::TileId};
 use rtfarm_job::{Outcome, Progress};
-use rtfarm_proto::{JobId, LONGEST_WAIT, LeaseId, LeaseName, WorkerId};
+use rtfarm_proto::{Incarnation, JobId, LONGEST_WAIT, LeaseId, LeaseName, WorkerId};
 
 use crate::{
+    identity::{Identity, Stranger},
     lease::{Leases, Loss, Run},
     members::{Members, NoMember, Process},
     tiles::{Arrival, PixelHash, Tiles},
@@ -36,6 +37,9 @@ const STOPPED: &str = "the coordinator was stopped";
 /// answer.
 #[derive(Debug)]
 pub(crate) struct Farm {
+    identity: Identity,
+    /// Calls that were meant for another incarnation.
+    stranger_count: u64,
     term: Duration,
     members: Members,
     leases: Leases,
@@ -151,19 +155,23 @@ pub(crate) enum Notice {
     JobFailed(JobId, String),
     /// A client cancelled a job.
     JobCancelled(JobId),
+    /// So many calls were refused, since they were meant for another incarnation.
+    Strangers(u64),
 }
 
 impl Farm {
     /// Makes a farm without members and jobs. A lease lives for `term` after the last progress.
-    pub(crate) fn new(term: Duration) -> Self {
+    pub(crate) fn new(identity: Identity, term: Duration) -> Self {
         Self {
+            identity,
+            stranger_count: 0,
             term,
             members: Members::new(LONGEST_SILENCE.max(term)),
             leases: Leases::new(term),
             waiting: Waiting::default(),
             jobs: BTreeMap::new(),
             ended: VecDeque::new(),
-            last_job: JobId(0),
+            last_job: identity.job_before_first(),
             phase: Phase::Open,
         }
     }
@@ -192,6 +200,22 @@ impl Farm {
         self.serve(now, &mut actions);
         self.end_farewell(now, &mut actions);
         actions
+    }
+
+    /// Event: a call comes that is neither to join nor to submit. What it asks for may be done only
+    /// if it is meant for this incarnation.
+    pub(crate) fn on_call(
+        &mut self,
+        incarnation: Incarnation,
+    ) -> (Result<(), Stranger>, Vec<Action>) {
+        if incarnation == self.identity.incarnation {
+            return (Ok(()), Vec::new());
+        }
+        self.stranger_count += 1;
+        // Strangers cannot fill the log.
+        let is_told = self.stranger_count.is_power_of_two();
+        let told = is_told.then_some(Action::Log(Notice::Strangers(self.stranger_count)));
+        (Err(Stranger), told.into_iter().collect())
     }
 
     // Members.
@@ -514,6 +538,11 @@ impl Farm {
 
 #[cfg(test)]
 impl Farm {
+    /// Which start of the farm this is.
+    pub(crate) fn incarnation(&self) -> Incarnation {
+        self.identity.incarnation
+    }
+
     /// Checks every invariant, at the price of a scan.
     pub(crate) fn check(&self) {
         let is_member = |worker| self.members.contains(worker);
@@ -552,7 +581,8 @@ mod tests {
         fn new() -> Self {
             #[expect(clippy::disallowed_methods, reason = "any instant will do")]
             let now = Instant::now();
-            Self { farm: Farm::new(TERM), now, last_number: 0 }
+            let identity = Identity::from_random([1; 24]);
+            Self { farm: Farm::new(identity, TERM), now, last_number: 0 }
         }
 
         fn number(&mut self) -> u64 {
@@ -660,6 +690,32 @@ mod tests {
         let job =
             |action: &Action| if let Action::Forget(job) = action { Some(*job) } else { None };
         actions.iter().filter_map(job).collect()
+    }
+
+    #[test]
+    fn a_call_meant_for_another_incarnation_is_refused_and_counted() {
+        let mut world = World::new();
+        let ours = world.farm.incarnation();
+        assert!(matches!(world.farm.on_call(ours), (Ok(()), actions) if actions.is_empty()));
+        let mut told = Vec::new();
+        for _ in 0..5 {
+            let (admitted, actions) = world.farm.on_call(Incarnation(ours.0 + 1));
+            assert_eq!(admitted, Err(Stranger));
+            told.extend(actions.into_iter().map(|action| match action {
+                Action::Log(Notice::Strangers(count)) => count,
+                other => panic!("{other:?}"),
+            }));
+        }
+        assert_eq!(told, [1, 2, 4], "strangers cannot fill the log");
+    }
+
+    #[test]
+    fn incarnations_number_their_jobs_differently() {
+        let identities = [[1; 24], [2; 24]].map(Identity::from_random);
+        let mut farms = identities.map(|identity| Farm::new(identity, TERM));
+        let numbers: BTreeSet<JobId> =
+            farms.iter_mut().flat_map(|farm| [farm.number_job(), farm.number_job()]).collect();
+        assert_eq!(numbers.len(), 4);
     }
 
     #[test]

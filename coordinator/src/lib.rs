@@ -7,10 +7,11 @@
 //! knows only what stands before it:
 //!
 //! ```text
-//! tiles <- lease, members, waiting <- farm, store, job <- shell <- service <- run
+//! identity, tiles <- lease, members, waiting <- farm, store, job <- shell <- service <- run
 //! ```
 
 mod farm;
+mod identity;
 mod job;
 mod lease;
 mod members;

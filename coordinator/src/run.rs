@@ -1,6 +1,6 @@
 //! The coordinator as a process part: its handle, and the loop that runs it.
 
-use std::{sync::Arc, time::Duration};
+use std::{io, sync::Arc, time::Duration};
 
 use rtfarm_job::Order;
 use rtfarm_proto::JobId;
@@ -10,6 +10,7 @@ use tokio_util::sync::CancellationToken;
 use tonic::transport::server::Router;
 
 use crate::{
+    identity::Identity,
     job::Job,
     service,
     shell::{Config, Shell, SubmitError},
@@ -34,9 +35,11 @@ pub enum Listener {
 const CLOSING: Duration = Duration::from_millis(1500);
 
 impl Coordinator {
-    /// Makes a coordinator without jobs and workers.
-    pub fn new(config: Config) -> Self {
-        Self { shell: Arc::new(Shell::new(config)) }
+    /// Makes a coordinator without jobs and workers, and draws its identity.
+    pub fn new(config: Config) -> io::Result<Self> {
+        let mut random = [0; 24];
+        rustix::rand::getrandom(&mut random, rustix::rand::GetRandomFlags::empty())?;
+        Ok(Self { shell: Arc::new(Shell::new(config, Identity::from_random(random))) })
     }
 
     /// Takes an order. This writes files: never call it on the async runtime.

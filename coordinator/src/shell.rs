@@ -16,12 +16,13 @@ use rtfarm_core::{
 };
 use rtfarm_job::{FinishedTile, Order, Progress};
 use rtfarm_picture::Picture;
-use rtfarm_proto::{JobId, LeaseName, WorkerId};
+use rtfarm_proto::{Incarnation, JobId, LeaseName, WorkerId};
 use tokio::sync::{Notify, oneshot, watch};
 use tokio_util::sync::CancellationToken;
 
 use crate::{
     farm::{Action, Delivery, DeliveryId, Farm, Next, Notice, Verdict},
+    identity::{Identity, Stranger},
     job::Job,
     members::{NoMember, Process},
     store::SceneFile,
@@ -56,6 +57,7 @@ pub enum SubmitError {
 /// The machine and all that its answers concern.
 #[derive(Debug)]
 pub(crate) struct Shell {
+    pub(crate) identity: Identity,
     pub(crate) config: Config,
     /// Held for a moment: nothing is written and nobody is waited for under it.
     state: Mutex<State>,
@@ -102,9 +104,9 @@ enum Work {
 
 impl Shell {
     /// Makes a farm without jobs and workers.
-    pub(crate) fn new(config: Config) -> Self {
+    pub(crate) fn new(config: Config, identity: Identity) -> Self {
         let state = State {
-            farm: Farm::new(config.term),
+            farm: Farm::new(identity, config.term),
             jobs: BTreeMap::new(),
             asks: HashMap::new(),
             deliveries: HashMap::new(),
@@ -112,6 +114,7 @@ impl Shell {
             wakes_at: None,
         };
         Self {
+            identity,
             config,
             state: Mutex::new(state),
             earlier: Notify::new(),
@@ -216,6 +219,11 @@ impl Shell {
                 () = self.earlier.notified() => {}
             }
         }
+    }
+
+    /// Lets a call in that is meant for this incarnation.
+    pub(crate) fn admit(&self, incarnation: u64) -> Result<(), Stranger> {
+        self.tell(|state, _| state.farm.on_call(Incarnation(incarnation)))
     }
 
     pub(crate) fn join(&self, process: Process) -> WorkerId {
@@ -403,6 +411,9 @@ fn log(notice: Notice) {
             "two copies of a tile differ; one of their workers is broken"
         ),
         Notice::JobFailed(job, reason) => tracing::warn!(job = job.0, reason, "job failed"),
+        Notice::Strangers(count) => {
+            tracing::warn!(count, "calls meant for another start of a coordinator were refused");
+        }
         Notice::JobCancelled(job) => tracing::info!(job = job.0, "job cancelled"),
     }
 }

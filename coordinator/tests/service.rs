@@ -27,6 +27,7 @@ struct Farm {
     tiles: FarmClient<Channel>,
     jobs: JobsClient<Channel>,
     worker: u32,
+    incarnation: u64,
     job: u64,
 }
 
@@ -41,13 +42,15 @@ impl Farm {
             term: Duration::from_millis(300),
             scene_folder: folder.path().to_owned(),
             picture_folder: folder.path().to_owned(),
-        });
+        })
+        .unwrap();
         tokio::spawn(async move {
             coordinator.run(Listener::Tcp(listener), std::future::pending()).await
         });
         let channel = address.connect().await.unwrap();
         let (mut tiles, mut jobs) = (FarmClient::new(channel.clone()), JobsClient::new(channel));
-        let worker = tiles.join(join(VERSION)).await.unwrap().into_inner().worker;
+        let joined = tiles.join(join(VERSION)).await.unwrap().into_inner();
+        let wire::JoinResponse { worker, incarnation, .. } = joined;
         let order = wire::Order {
             version: VERSION.to_owned(),
             protocol: PROTOCOL,
@@ -65,12 +68,18 @@ impl Farm {
             .map(|part| wire::SubmitRequest { part: Some(part) });
         let answer = jobs.submit(tokio_stream::iter(parts)).await.unwrap().into_inner();
         let Some(Outcome::Accepted(accepted)) = answer.outcome else { panic!("{answer:?}") };
-        assert_eq!(accepted.tile_count, 2);
-        Self { _folder: folder, tiles, jobs, worker, job: accepted.job }
+        assert_eq!((accepted.tile_count, accepted.incarnation), (2, incarnation));
+        assert_eq!(accepted.farm, joined.farm);
+        Self { _folder: folder, tiles, jobs, worker, incarnation, job: accepted.job }
     }
 
     async fn lease(&mut self) -> (LeaseName, Vec<u32>) {
-        let request = wire::LeaseRequest { worker: self.worker, max_tiles: 64, wait_ms: 5000 };
+        let request = wire::LeaseRequest {
+            worker: self.worker,
+            max_tiles: 64,
+            wait_ms: 5000,
+            incarnation: self.incarnation,
+        };
         match self.tiles.lease(request).await.unwrap().into_inner().next {
             Some(Next::Run(run)) => (run.lease.unwrap().into(), run.tiles),
             other => panic!("no tiles but {other:?}"),
@@ -97,6 +106,7 @@ impl Farm {
     ) -> Result<wire::Verdict, Code> {
         let delivery = wire::DeliverRequest {
             worker: self.worker,
+            incarnation: self.incarnation,
             lease: Some(lease.into()),
             tile,
             pixels: pixels.into(),
@@ -110,7 +120,7 @@ impl Farm {
 
     /// The state of the job now.
     async fn state(&mut self) -> wire::Event {
-        let request = wire::WatchRequest { job: self.job };
+        let request = wire::WatchRequest { job: self.job, incarnation: self.incarnation };
         let mut events = self.jobs.watch(request).await.unwrap().into_inner();
         events.message().await.unwrap().unwrap()
     }
@@ -149,7 +159,11 @@ async fn a_lease_without_progress_is_given_again_and_late_pixels_count() {
             break (lease, more);
         }
     };
-    let renewal = wire::RenewRequest { worker: farm.worker, leases: vec![late.into()] };
+    let renewal = wire::RenewRequest {
+        worker: farm.worker,
+        leases: vec![late.into()],
+        incarnation: farm.incarnation,
+    };
     let lost = farm.tiles.renew(renewal).await.unwrap().into_inner().lost;
     assert_eq!(lost, [late.into()]);
     assert_eq!(farm.deliver(late, tiles[0], 0.5).await, Ok(wire::Verdict::Accepted));
@@ -181,12 +195,38 @@ async fn strangers_are_told_what_is_wrong() {
     let status = farm.tiles.join(join("1.2.4")).await.unwrap_err();
     assert_eq!(status.code(), Code::FailedPrecondition);
     assert!(status.message().contains("rtfarm 1.2.4") && status.message().contains(VERSION));
-    let request = wire::LeaseRequest { worker: 77, max_tiles: 1, wait_ms: 0 };
+    let incarnation = farm.incarnation;
+    let request = wire::LeaseRequest { worker: 77, max_tiles: 1, wait_ms: 0, incarnation };
     assert_eq!(farm.tiles.lease(request).await.unwrap_err().code(), Code::NotFound);
-    let request = wire::FetchRequest { scene_hash: vec![1; 32].into() };
+    let request = wire::FetchRequest { scene_hash: vec![1; 32].into(), incarnation };
     assert_eq!(farm.tiles.fetch(request).await.unwrap_err().code(), Code::NotFound);
-    let request = wire::WatchRequest { job: 77 };
+    let request = wire::WatchRequest { job: 77, incarnation };
     assert_eq!(farm.jobs.watch(request).await.unwrap_err().code(), Code::NotFound);
-    let request = wire::ImageRequest { job: farm.job };
+    let request = wire::ImageRequest { job: farm.job, incarnation };
     assert_eq!(farm.jobs.image(request).await.unwrap_err().code(), Code::FailedPrecondition);
+}
+
+#[tokio::test]
+async fn calls_meant_for_another_start_of_the_coordinator_are_refused() {
+    let mut farm = Farm::new().await;
+    let (lease, tiles) = farm.lease().await;
+    let (worker, job, incarnation) = (farm.worker, farm.job, farm.incarnation ^ 1);
+    let request = wire::LeaseRequest { worker, incarnation, max_tiles: 1, wait_ms: 0 };
+    let status = farm.tiles.lease(request).await.unwrap_err();
+    assert_eq!(status.code(), Code::NotFound);
+    assert!(status.message().contains("not meant for this start"), "{status}");
+    let leases = vec![lease.into()];
+    let request = wire::RenewRequest { worker, incarnation, leases };
+    assert_eq!(farm.tiles.renew(request).await.unwrap_err().code(), Code::NotFound);
+    let request = wire::LeaveRequest { worker, incarnation, reason: String::new() };
+    assert_eq!(farm.tiles.leave(request).await.unwrap_err().code(), Code::NotFound);
+    let request = wire::WatchRequest { job, incarnation };
+    assert_eq!(farm.jobs.watch(request).await.unwrap_err().code(), Code::NotFound);
+    let request = wire::CancelRequest { job, incarnation };
+    assert_eq!(farm.jobs.cancel(request).await.unwrap_err().code(), Code::NotFound);
+    farm.incarnation ^= 1;
+    assert_eq!(farm.deliver(lease, tiles[0], 0.5).await, Err(Code::NotFound));
+    farm.incarnation ^= 1;
+    assert_eq!(farm.state().await.tiles_done, 0);
+    assert_eq!(farm.deliver(lease, tiles[0], 0.5).await, Ok(wire::Verdict::Accepted));
 }

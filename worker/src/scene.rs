@@ -62,7 +62,10 @@ async fn fetch(
 ) -> Result<File, SceneError> {
     // The file has no name, so that nothing stays behind.
     let mut file = tempfile::tempfile()?;
-    let request = wire::FetchRequest { scene_hash: job.scene.0.to_vec().into() };
+    let request = wire::FetchRequest {
+        scene_hash: job.scene.0.to_vec().into(),
+        incarnation: job.incarnation.0,
+    };
     let late = |_| SceneError::Fetch("the coordinator was silent for too long".to_owned());
     let fetched = tokio::time::timeout(silence, client.fetch(request));
     let mut chunks = fetched.await.map_err(late)??.into_inner();
