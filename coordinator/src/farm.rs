@@ -40,6 +40,8 @@ pub(crate) struct Farm {
     identity: Identity,
     /// Calls that were meant for another incarnation.
     stranger_count: u64,
+    /// Tiles that came from workers that were never to render them.
+    ungranted_count: u64,
     term: Duration,
     members: Members,
     leases: Leases,
@@ -113,7 +115,7 @@ pub(crate) enum Verdict {
     Accepted,
     /// Earlier pixels of the tile are in the picture.
     Duplicate,
-    /// The job is over.
+    /// The job is over, or the worker was never to render the tile.
     Rejected,
 }
 
@@ -155,6 +157,9 @@ pub(crate) enum Notice {
     JobFailed(JobId, String),
     /// A client cancelled a job.
     JobCancelled(JobId),
+    /// Pixels came of a tile that their worker was never to render under that lease, as the last of
+    /// so many.
+    NotGranted { delivery: Delivery, count: u64 },
     /// So many calls were refused, since they were meant for another incarnation.
     Strangers(u64),
 }
@@ -165,6 +170,7 @@ impl Farm {
         Self {
             identity,
             stranger_count: 0,
+            ungranted_count: 0,
             term,
             members: Members::new(LONGEST_SILENCE.max(term)),
             leases: Leases::new(term),
@@ -346,7 +352,8 @@ impl Farm {
         self.leases.tiles(job)?.grid().tile(number)
     }
 
-    /// Event: pixels came. The first of a tile are stored, and acknowledged when that is done.
+    /// Event: pixels came. The first of a tile are stored, and acknowledged when that is done. They
+    /// are taken only from a worker that was to render the tile under that lease, however late.
     pub(crate) fn on_pixels(
         &mut self,
         id: DeliveryId,
@@ -354,7 +361,17 @@ impl Farm {
         now: Instant,
     ) -> Vec<Action> {
         let Delivery { worker, lease, tile, hash, .. } = delivery;
-        // Pixels are welcome from anyone: a worker may have been given up meanwhile.
+        if self.leases.tiles(lease.job).is_some() && !self.leases.is_granted(worker, lease, tile) {
+            let mut actions = vec![Action::Acknowledge(id, Verdict::Rejected)];
+            self.ungranted_count += 1;
+            let count = self.ungranted_count;
+            // Strangers cannot fill the log.
+            if count.is_power_of_two() {
+                actions.push(Action::Log(Notice::NotGranted { delivery, count }));
+            }
+            return actions;
+        }
+        // The worker may have been given up meanwhile.
         let _ = self.members.on_sign_of_life(worker, now);
         let arrival = self.leases.on_pixels(worker, lease, tile, hash, now);
         let (Some(arrival), Some(job)) = (arrival, self.jobs.get_mut(&lease.job)) else {
@@ -761,6 +778,40 @@ mod tests {
         assert_eq!(verdicts(&world.store(&run)), expected);
         let (late, actions) = world.deliver(worker, &run, 7);
         assert_eq!(verdicts(&actions), [(late, Verdict::Duplicate)]);
+    }
+
+    #[test]
+    fn pixels_are_taken_only_from_a_worker_that_was_to_render_them_under_that_lease() {
+        let mut world = World::new();
+        let (worker, other) = (world.join(), world.join());
+        let (job, _) = world.submit(2);
+        let (first, second) = (world.lease(worker), world.lease(worker));
+        let with = |lease, tile: TileId| Run { lease, tiles: vec![tile] };
+        let no_lease = LeaseName { job, id: LeaseId(99) };
+        for (from, run) in [
+            (other, first.clone()),
+            (WorkerId(77), first.clone()),
+            (worker, with(first.lease, second.tiles[0])),
+            (worker, with(no_lease, first.tiles[0])),
+        ] {
+            let (id, actions) = world.deliver(from, &run, 9);
+            assert_eq!(verdicts(&actions), [(id, Verdict::Rejected)], "{from} {run:?}");
+        }
+        // However late, and though the worker is no member any more.
+        world.pass(LONGEST_SILENCE * 2);
+        assert!(!world.farm.members.contains(worker));
+        let actions = world.stitch(worker, &first);
+        assert_eq!(shown(&actions).tiles_done, 1);
+        let mut told = Vec::new();
+        for _ in 0..5 {
+            told.extend(world.deliver(other, &second, 9).1.into_iter().filter_map(|action| {
+                match action {
+                    Action::Log(Notice::NotGranted { count, .. }) => Some(count),
+                    _ => None,
+                }
+            }));
+        }
+        assert_eq!(told, [8], "strangers cannot fill the log");
     }
 
     #[test]

@@ -38,6 +38,16 @@ pub(crate) struct Leases {
     last_tiles: BTreeSet<(Instant, LeaseId)>,
     by_worker: BTreeSet<(WorkerId, LeaseId)>,
     by_job: BTreeSet<(JobId, LeaseId)>,
+    /// Every lease that was ever given of these jobs, and what it covered.
+    granted: BTreeMap<JobId, BTreeMap<LeaseId, Grant>>,
+}
+
+/// Who may bring which tiles under a lease, even after its end.
+#[derive(Debug)]
+struct Grant {
+    worker: WorkerId,
+    /// In ascending order.
+    tiles: Box<[TileId]>,
 }
 
 #[derive(Debug)]
@@ -82,6 +92,7 @@ impl Leases {
             last_tiles: BTreeSet::new(),
             by_worker: BTreeSet::new(),
             by_job: BTreeSet::new(),
+            granted: BTreeMap::new(),
         }
     }
 
@@ -117,6 +128,7 @@ impl Leases {
         }
         self.jobs.remove(&job);
         self.with_free.remove(&job);
+        self.granted.remove(&job);
     }
 
     /// Event: `worker`, with `threads` of the farm's `all_threads`, would render up to `most` free
@@ -174,6 +186,9 @@ impl Leases {
             lease: LeaseName { job, id },
             tiles: tiles.at(if alone.is_empty() { &shared } else { &alone }),
         };
+        let mut granted: Box<[TileId]> = run.tiles.as_slice().into();
+        granted.sort_unstable();
+        self.granted.entry(job).or_default().insert(id, Grant { worker, tiles: granted });
         let until = now + self.term;
         self.expiries.insert((until, id));
         self.by_worker.insert((worker, id));
@@ -198,8 +213,15 @@ impl Leases {
         }
     }
 
-    /// Event: pixels of `tile` came from `worker`. Tiles are deterministic: the first copy wins,
-    /// however late and whoever sent it. `None` when the job is over.
+    /// Says whether `worker` was ever to render `tile` under a lease of a job that has not ended.
+    pub(crate) fn is_granted(&self, worker: WorkerId, name: LeaseName, tile: TileId) -> bool {
+        let grant = self.granted.get(&name.job).and_then(|granted| granted.get(&name.id));
+        grant
+            .is_some_and(|grant| grant.worker == worker && grant.tiles.binary_search(&tile).is_ok())
+    }
+
+    /// Event: pixels of `tile` came from `worker`, which was granted it. Tiles are deterministic:
+    /// the first copy wins, however late. `None` when the job is over.
     pub(crate) fn on_pixels(
         &mut self,
         worker: WorkerId,
@@ -328,6 +350,13 @@ impl Leases {
         assert!(self.expiries == leases().map(|(&id, lease)| (lease.until, id)).collect());
         assert!(self.by_worker == leases().map(|(&id, lease)| (lease.worker, id)).collect());
         assert!(self.by_job == leases().map(|(&id, lease)| (lease.job, id)).collect());
+        assert!(self.granted.keys().all(|job| self.jobs.contains_key(job)));
+        for (id, lease) in &self.held {
+            let places = lease.alone.union(&lease.shared).copied().collect();
+            for tile in self.jobs[&lease.job].at(&places) {
+                assert!(self.is_granted(lease.worker, LeaseName { job: lease.job, id: *id }, tile));
+            }
+        }
         let alone = leases().filter(|(_, lease)| !lease.alone.is_empty());
         assert!(self.last_tiles == alone.map(|(&id, lease)| (lease.last_tile, id)).collect());
     }

@@ -184,8 +184,8 @@ fn take(
 ) -> Result<Option<oneshot::Receiver<Verdict>>, Status> {
     let lease = request.lease.ok_or_else(|| invalid(WireError::Missing("lease")))?;
     let (worker, lease) = (WorkerId(request.worker), LeaseName::from(lease));
-    let Some((tile, area)) = shell.tile(lease.job, request.tile) else { return Ok(None) };
-    let hash: PixelHash = *blake3::hash(&request.pixels).as_bytes();
+    let Some((tile, job)) = shell.tile(lease.job, request.tile) else { return Ok(None) };
+    let hash: PixelHash = job.hasher.hash(tile, &request.pixels);
     let pixels = pixels_from_bytes(&request.pixels).map_err(invalid)?;
     let tally = request.tally.ok_or_else(|| invalid(WireError::Missing("tally")))?;
     let tally = Tally::try_from(tally).map_err(invalid)?;
@@ -193,7 +193,7 @@ fn take(
         tracing::error!(worker = worker.0, tile = tile.number(), "pixels were damaged");
         return Err(Status::data_loss("the pixels do not have the hash they came with"));
     }
-    if let Err(error) = check_pixels(area, &pixels) {
+    if let Err(error) = check_pixels(job.grid.area(tile), &pixels) {
         shell.report_senseless_pixels(worker, lease.job, tile, &error.to_string());
         return Ok(None);
     }

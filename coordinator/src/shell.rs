@@ -10,13 +10,10 @@ use std::{
     time::{Duration, Instant},
 };
 
-use rtfarm_core::{
-    prepared::SceneHash,
-    tile::{Area, TileId},
-};
+use rtfarm_core::{prepared::SceneHash, tile::TileId};
 use rtfarm_job::{FinishedTile, Order, Progress};
 use rtfarm_picture::Picture;
-use rtfarm_proto::{Incarnation, JobId, LeaseName, WorkerId};
+use rtfarm_proto::{Incarnation, JobId, LeaseName, TileHasher, WorkerId};
 use tokio::sync::{Notify, oneshot, watch};
 use tokio_util::sync::CancellationToken;
 
@@ -255,11 +252,11 @@ impl Shell {
         self.tell(|state, now| (state.farm.on_renew(worker, leases, now), Vec::new()))
     }
 
-    /// A tile of a job that is being rendered, and its pixels' place in the picture.
-    pub(crate) fn tile(&self, job: JobId, number: u32) -> Option<(TileId, Area)> {
+    /// A tile of a job that is being rendered, and that job.
+    pub(crate) fn tile(&self, job: JobId, number: u32) -> Option<(TileId, Arc<Job>)> {
         let state = self.state();
         let tile = state.farm.tile(job, number)?;
-        Some((tile, state.jobs.get(&job)?.grid.area(tile)))
+        Some((tile, Arc::clone(state.jobs.get(&job)?)))
     }
 
     /// Brings the pixels of a tile. The answer comes when they are safe. This writes a file: never
@@ -320,7 +317,8 @@ impl Shell {
         );
         let progress =
             watch::Sender::new(Progress { tile_count: grid.count(), ..Progress::default() });
-        let job = Arc::new(Job { id, scene, settings, grid, picture, progress });
+        let hasher = TileHasher::new(id, scene.hash(), settings, grid.side());
+        let job = Arc::new(Job { id, scene, settings, grid, hasher, picture, progress });
         // Not under the lock: there may be a million.
         let tiles = Tiles::new(grid);
         self.tell(|state, now| {
@@ -411,6 +409,16 @@ fn log(notice: Notice) {
             "two copies of a tile differ; one of their workers is broken"
         ),
         Notice::JobFailed(job, reason) => tracing::warn!(job = job.0, reason, "job failed"),
+        Notice::NotGranted { delivery: Delivery { worker, lease, tile, .. }, count } => {
+            tracing::warn!(
+                worker = worker.0,
+                job = lease.job.0,
+                lease = lease.id.0,
+                tile = tile.number(),
+                count,
+                "pixels came that nobody was to render so"
+            );
+        }
         Notice::Strangers(count) => {
             tracing::warn!(count, "calls meant for another start of a coordinator were refused");
         }

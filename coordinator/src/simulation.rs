@@ -13,7 +13,7 @@ use rtfarm_core::{
     tile::{Size, TileGrid, TileId},
 };
 use rtfarm_job::Outcome;
-use rtfarm_proto::{Incarnation, JobId, LeaseName, WorkerId};
+use rtfarm_proto::{Incarnation, JobId, LeaseId, LeaseName, WorkerId};
 
 use crate::{
     farm::{Action, Delivery, DeliveryId, Farm, Next, Notice, Verdict},
@@ -98,12 +98,16 @@ struct World {
     disk: Vec<(Instant, JobId, TileId)>,
     /// Questions without an answer, and until when they wait.
     asks: BTreeMap<AskId, Instant>,
+    /// Who asked each question.
+    workers: BTreeMap<AskId, WorkerId>,
     /// Deliveries without an answer, and their tiles.
     deliveries: BTreeMap<DeliveryId, (JobId, TileId)>,
     /// The hashes of all pixels that came.
     brought: BTreeMap<DeliveryId, PixelHash>,
     /// What clients ordered, and what each job shows: no two the same.
     jobs: BTreeMap<JobId, u8>,
+    /// Every tile that a worker was to render under a lease.
+    granted: BTreeSet<(WorkerId, LeaseName, TileId)>,
     restart_count: u32,
     scene_count: u8,
     forgotten: BTreeSet<JobId>,
@@ -130,9 +134,11 @@ impl World {
             post: Vec::new(),
             disk: Vec::new(),
             asks: BTreeMap::new(),
+            workers: BTreeMap::new(),
             deliveries: BTreeMap::new(),
             brought: BTreeMap::new(),
             jobs: BTreeMap::new(),
+            granted: BTreeSet::new(),
             restart_count: 0,
             scene_count: 0,
             forgotten: BTreeSet::new(),
@@ -160,6 +166,12 @@ impl World {
             match action {
                 Action::Answer(ask, answer) => {
                     self.asks.remove(&ask).expect("a question is answered once");
+                    if let (Some(worker), Ok(Next::Render(run))) =
+                        (self.workers.remove(&ask), &answer)
+                    {
+                        let tiles = run.tiles.iter();
+                        self.granted.extend(tiles.map(|&tile| (worker, run.lease, tile)));
+                    }
                     let waits = |renderer: &&mut Renderer| renderer.ask == Some(ask);
                     let Some(renderer) = self.renderers.iter_mut().find(waits) else { continue };
                     renderer.ask = None;
@@ -224,6 +236,7 @@ impl World {
             };
             self.act(actions);
         }
+        self.let_strangers_deliver();
         let arrived: Vec<_> = self.post.extract_if(.., |(arrival, ..)| *arrival <= now).collect();
         for (_, incarnation, delivery) in arrived {
             if !self.is_admitted(incarnation) {
@@ -235,6 +248,38 @@ impl World {
             let actions = self.farm.on_pixels(id, delivery, now);
             self.act(actions);
         }
+    }
+
+    /// Somebody brings pixels of his own for a tile, with a worker's name and a lease that do not
+    /// belong together, or with the right names and the pixels of another tile's lease.
+    fn let_strangers_deliver(&mut self) {
+        if !self.random.one_in(10) {
+            return;
+        }
+        let Some(job) = self.jobs.keys().nth(self.random.below(JOBS as u64) as usize).copied()
+        else {
+            return;
+        };
+        let Some(tile) = self.farm.tile(job, self.random.below(TILES as u64) as u32) else {
+            return;
+        };
+        let lease = LeaseName { job, id: LeaseId(1 + self.random.below(20)) };
+        let worker = WorkerId(self.random.below(6) as u32);
+        let tally = Tally::default();
+        let delivery = Delivery { worker, lease, tile, hash: [0xee; 32], seconds: 0.1, tally };
+        if self.granted.contains(&(worker, lease, tile)) {
+            return;
+        }
+        let id = DeliveryId(self.number());
+        self.deliveries.insert(id, (job, tile));
+        let actions = self.farm.on_pixels(id, delivery, self.now);
+        let rejected = |action: &Action| match action {
+            Action::Acknowledge(answered, Verdict::Rejected) => *answered == id,
+            Action::Log(Notice::NotGranted { .. }) => true,
+            _ => false,
+        };
+        assert!(actions.iter().all(rejected) && !actions.is_empty(), "{actions:?}");
+        self.act(actions);
     }
 
     /// Clients order pictures of 7 x 5 tiles, and may change their minds.
@@ -319,6 +364,7 @@ impl World {
             self.renderers[index].ask = Some(id);
             let until = self.now + self.random.milliseconds_below(LONGEST_WAIT);
             self.asks.insert(id, until);
+            self.workers.insert(id, worker);
             let ask = Ask { worker, most: 1 + self.random.below(9) as usize, until };
             let actions = self.farm.on_ask(id, ask, self.now);
             self.act(actions);

@@ -3,9 +3,13 @@
 use std::time::Duration;
 
 use rtfarm_coordinator::{Config, Coordinator, Listener};
-use rtfarm_core::render::{Quality, Sampling};
+use rtfarm_core::{
+    prepared::SceneHash,
+    render::{Quality, Sampling, Settings},
+    tile::{Size, TileGrid},
+};
 use rtfarm_proto::{
-    Address, LeaseName, PROTOCOL, pixels_to_bytes,
+    Address, JobId, LeaseName, PROTOCOL, TileHasher, pixels_to_bytes, scene_hash,
     wire::{
         self, event::End, farm_client::FarmClient, jobs_client::JobsClient, lease_response::Next,
         submit_request::Part, submit_response::Outcome,
@@ -29,6 +33,8 @@ struct Farm {
     worker: u32,
     incarnation: u64,
     job: u64,
+    scene: SceneHash,
+    settings: Settings,
 }
 
 impl Farm {
@@ -70,7 +76,16 @@ impl Farm {
         let Some(Outcome::Accepted(accepted)) = answer.outcome else { panic!("{answer:?}") };
         assert_eq!((accepted.tile_count, accepted.incarnation), (2, incarnation));
         assert_eq!(accepted.farm, joined.farm);
-        Self { _folder: folder, tiles, jobs, worker, incarnation, job: accepted.job }
+        Self {
+            _folder: folder,
+            tiles,
+            jobs,
+            worker,
+            incarnation,
+            job: accepted.job,
+            scene: SceneHash([0; 32]),
+            settings: Settings { size: Size::new(16, 8).unwrap(), quality: Quality::default() },
+        }
     }
 
     async fn lease(&mut self) -> (LeaseName, Vec<u32>) {
@@ -81,7 +96,12 @@ impl Farm {
             incarnation: self.incarnation,
         };
         match self.tiles.lease(request).await.unwrap().into_inner().next {
-            Some(Next::Run(run)) => (run.lease.unwrap().into(), run.tiles),
+            Some(Next::Run(run)) => {
+                let job = run.job.unwrap();
+                self.scene = scene_hash(&job.scene_hash).unwrap();
+                self.settings = job.settings.unwrap().try_into().unwrap();
+                (run.lease.unwrap().into(), run.tiles)
+            }
             other => panic!("no tiles but {other:?}"),
         }
     }
@@ -93,8 +113,16 @@ impl Farm {
         value: f32,
     ) -> Result<wire::Verdict, Code> {
         let pixels = pixels_to_bytes(&[[value; 3]; 64]);
-        let hash = blake3::hash(&pixels).as_bytes().to_vec();
+        let hash = self.hash(tile, &pixels);
         self.send(lease, tile, pixels.to_vec(), hash).await
+    }
+
+    /// The hash that a worker gives such a tile; that of tile 0 when there is none of this number.
+    fn hash(&self, tile: u32, pixels: &[u8]) -> Vec<u8> {
+        let grid = TileGrid::new(self.settings.size, 8).unwrap();
+        let tile = grid.tile(tile).or(grid.tile(0)).unwrap();
+        let hasher = TileHasher::new(JobId(self.job), self.scene, self.settings, 8);
+        hasher.hash(tile, pixels).to_vec()
     }
 
     async fn send(
@@ -175,11 +203,15 @@ async fn damaged_and_senseless_pixels_are_refused() {
     let mut farm = Farm::new().await;
     let (lease, tiles) = farm.lease().await;
     let bytes = vec![0; 64 * 12];
-    let hash = blake3::hash(&bytes).as_bytes().to_vec();
-    assert_eq!(farm.send(lease, tiles[0], bytes, vec![0; 32]).await, Err(Code::DataLoss));
+    let hash = farm.hash(tiles[0], &bytes);
+    assert_eq!(farm.send(lease, tiles[0], bytes.clone(), vec![0; 32]).await, Err(Code::DataLoss));
     let short = vec![0; 13];
-    let short_hash = blake3::hash(&short).as_bytes().to_vec();
+    let short_hash = farm.hash(tiles[0], &short);
     assert_eq!(farm.send(lease, tiles[0], short, short_hash).await, Err(Code::InvalidArgument));
+    let other_tile = farm.hash(1 - tiles[0], &bytes);
+    assert_eq!(farm.send(lease, tiles[0], bytes.clone(), other_tile).await, Err(Code::DataLoss));
+    let plain = blake3::hash(&bytes).as_bytes().to_vec();
+    assert_eq!(farm.send(lease, tiles[0], bytes.clone(), plain).await, Err(Code::DataLoss));
     let rejected = Ok(wire::Verdict::Rejected);
     assert_eq!(farm.send(lease, 99, vec![0; 64 * 12], hash).await, rejected);
     assert_eq!(farm.state().await.tiles_done, 0);
@@ -228,5 +260,16 @@ async fn calls_meant_for_another_start_of_the_coordinator_are_refused() {
     assert_eq!(farm.deliver(lease, tiles[0], 0.5).await, Err(Code::NotFound));
     farm.incarnation ^= 1;
     assert_eq!(farm.state().await.tiles_done, 0);
+    assert_eq!(farm.deliver(lease, tiles[0], 0.5).await, Ok(wire::Verdict::Accepted));
+}
+
+#[tokio::test]
+async fn who_never_joined_brings_no_pixels() {
+    let mut farm = Farm::new().await;
+    let (lease, tiles) = farm.lease().await;
+    let member = std::mem::replace(&mut farm.worker, 77);
+    assert_eq!(farm.deliver(lease, tiles[0], 0.5).await, Ok(wire::Verdict::Rejected));
+    assert_eq!(farm.state().await.tiles_done, 0);
+    farm.worker = member;
     assert_eq!(farm.deliver(lease, tiles[0], 0.5).await, Ok(wire::Verdict::Accepted));
 }

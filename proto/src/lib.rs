@@ -5,11 +5,13 @@
 mod address;
 mod convert;
 mod name;
+mod tile_hash;
 
 pub use address::{Address, AddressError};
 pub use convert::{WireError, pixels_from_bytes, pixels_to_bytes, scene_hash, transfer};
 pub use name::{FarmId, Incarnation, JobId, LeaseId, LeaseName, WorkerId};
 pub use prost::bytes::Bytes;
+pub use tile_hash::TileHasher;
 
 /// The messages, clients and servers that `proto/generate` writes from `farm.proto`.
 #[expect(

@@ -71,7 +71,7 @@ pub(crate) struct Delivery {
     pub(crate) tile: TileId,
     /// Red, green and blue as little-endian f32, row by row.
     pub(crate) pixels: Bytes,
-    /// The BLAKE3 hash of `pixels`.
+    /// What the job's `TileHasher` makes of them.
     pub(crate) hash: [u8; 32],
     pub(crate) tally: Tally,
     /// What the tile took one thread.

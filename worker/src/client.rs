@@ -4,7 +4,7 @@
 use std::{error::Error, sync::Arc, time::Duration};
 
 use rtfarm_proto::{
-    Address, FarmId, Incarnation, MESSAGE_BYTES, PROTOCOL, WireError, WorkerId,
+    Address, FarmId, Incarnation, LeaseName, MESSAGE_BYTES, PROTOCOL, WireError, WorkerId,
     wire::{self, farm_client::FarmClient, lease_response},
 };
 use tonic::{Code, Status, transport::Channel};
@@ -118,8 +118,8 @@ fn read_next(answer: wire::LeaseResponse, incarnation: Incarnation) -> Result<Ne
 }
 
 fn read_run(run: wire::Run, incarnation: Incarnation) -> Result<Run, JobError> {
-    let lease = run.lease.ok_or(WireError::Missing("lease"))?.into();
-    let job = Job::new(&run.job.ok_or(WireError::Missing("job"))?, incarnation)?;
+    let lease = LeaseName::from(run.lease.ok_or(WireError::Missing("lease"))?);
+    let job = Job::new(lease.job, &run.job.ok_or(WireError::Missing("job"))?, incarnation)?;
     let tile = |&number| job.grid.tile(number).ok_or(WireError::Missing("tile"));
     let tiles = run.tiles.iter().map(tile).collect::<Result<_, _>>()?;
     Ok(Run { lease, tiles, job: Arc::new(job) })

@@ -7,7 +7,7 @@ use rtfarm_core::{
     render::Settings,
     tile::{TileGrid, TileSideError},
 };
-use rtfarm_proto::{Incarnation, WireError, scene_hash, wire};
+use rtfarm_proto::{Incarnation, JobId, TileHasher, WireError, scene_hash, wire};
 
 /// What a worker needs to know to render tiles of a job.
 #[derive(Debug, Clone, PartialEq)]
@@ -20,6 +20,8 @@ pub(crate) struct Job {
     pub(crate) scene_path: Option<Arc<Path>>,
     pub(crate) settings: Settings,
     pub(crate) grid: TileGrid,
+    /// Hashes its pixels.
+    pub(crate) hasher: TileHasher,
 }
 
 /// Why a message describes no job.
@@ -33,15 +35,21 @@ pub(crate) enum JobError {
 
 impl Job {
     /// Reads what a coordinator says of a job.
-    pub(crate) fn new(job: &wire::Job, incarnation: Incarnation) -> Result<Self, JobError> {
+    pub(crate) fn new(
+        id: JobId,
+        job: &wire::Job,
+        incarnation: Incarnation,
+    ) -> Result<Self, JobError> {
         let settings: Settings = job.settings.ok_or(WireError::Missing("settings"))?.try_into()?;
+        let scene = scene_hash(&job.scene_hash)?;
         Ok(Self {
             incarnation,
-            scene: scene_hash(&job.scene_hash)?,
+            scene,
             scene_byte_count: job.scene_bytes,
             scene_path: (!job.scene_path.is_empty()).then(|| Path::new(&job.scene_path).into()),
             settings,
             grid: TileGrid::new(settings.size, job.tile_side.into())?,
+            hasher: TileHasher::new(id, scene, settings, job.tile_side),
         })
     }
 }

@@ -6,7 +6,7 @@ use rtfarm_core::{
     render::{Quality, Settings, Tally},
     tile::{Size, TileGrid},
 };
-use rtfarm_proto::{FarmId, Incarnation, WorkerId, wire};
+use rtfarm_proto::{FarmId, Incarnation, JobId, TileHasher, WorkerId, wire};
 
 use super::*;
 
@@ -32,13 +32,15 @@ fn grid() -> TileGrid {
 }
 
 fn job(scene: u8) -> Arc<Job> {
+    let settings = Settings { size: Size::new(160, 160).unwrap(), quality: Quality::default() };
     Arc::new(Job {
         incarnation: Incarnation(1),
         scene: SceneHash([scene; 32]),
         scene_byte_count: 1,
         scene_path: None,
-        settings: Settings { size: Size::new(160, 160).unwrap(), quality: Quality::default() },
+        settings,
         grid: grid(),
+        hasher: TileHasher::new(JobId(1), SceneHash([scene; 32]), settings, 16),
     })
 }
 
