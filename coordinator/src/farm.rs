@@ -59,6 +59,11 @@ struct JobState {
     started: Instant,
     progress: Progress,
     contributors: BTreeSet<WorkerId>,
+    /// Workers that brought pixels that make no sense. They get no more tiles of this job while
+    /// there is another worker.
+    suspects: BTreeSet<WorkerId>,
+    /// Tiles of which such pixels came: who brought the last, under which lease.
+    senseless: BTreeMap<TileId, (WorkerId, LeaseId)>,
     storing: BTreeMap<TileId, Storing>,
 }
 
@@ -159,7 +164,9 @@ pub(crate) enum Notice {
     JobCancelled(JobId),
     /// Pixels came of a tile that their worker was never to render under that lease, as the last of
     /// so many.
-    NotGranted { delivery: Delivery, count: u64 },
+    NotGranted { worker: WorkerId, lease: LeaseName, tile: TileId, count: u64 },
+    /// A worker brought pixels that make no sense, for that reason.
+    Suspect { worker: WorkerId, job: JobId, tile: TileId, reason: String },
     /// So many calls were refused, since they were meant for another incarnation.
     Strangers(u64),
 }
@@ -298,13 +305,11 @@ impl Farm {
     /// longest, then quiet leases are rendered a second time, then the rest may have waited
     /// long enough.
     fn serve(&mut self, now: Instant, actions: &mut Vec<Action>) {
-        while let Some((id, ask)) = self.waiting.first()
-            && let Some(run) = {
-                let threads = self.members.threads(ask.worker);
-                self.leases.on_idle(ask.worker, threads, ask.most, now)
-            }
-        {
+        while let Some((id, ask, job)) = self.next_work(now) {
             self.waiting.remove(id);
+            let threads = self.members.threads(ask.worker);
+            let run = self.leases.on_idle(ask.worker, job, threads, ask.most, now);
+            let run = run.expect("the job has a free tile");
             actions.push(Action::Answer(id, Ok(Next::Render(run))));
         }
         while let Some((from, id, quiet)) = self.next_second_rendering()
@@ -323,13 +328,35 @@ impl Farm {
         }
     }
 
+    /// What the worker that waits longest of those that may have some gets, while there are free
+    /// tiles: free tiles of the earliest job that has any.
+    fn next_work(&self, now: Instant) -> Option<(AskId, Ask, JobId)> {
+        if !self.leases.has_free() {
+            return None;
+        }
+        self.waiting.iter().find_map(|(id, ask)| {
+            let mut jobs = self.leases.jobs().filter(|&(_, free_count)| free_count > 0);
+            let (job, _) = jobs.find(|&(job, _)| self.may_render(ask.worker, job))?;
+            Some((id, ask, job))
+        })
+    }
+
+    /// Says whether a worker may have tiles of a job: one under suspicion only if all are.
+    fn may_render(&self, worker: WorkerId, job: JobId) -> bool {
+        self.jobs.get(&job).is_none_or(|JobState { suspects, .. }| {
+            !suspects.contains(&worker) || self.members.all(|member| suspects.contains(&member))
+        })
+    }
+
     /// From when on which waiting question can be answered with a tile of which quiet lease.
     fn next_second_rendering(&self) -> Option<(Instant, AskId, LeaseId)> {
         self.waiting.first()?;
         // With two that wait, the first lease will do; with one, all but its own.
         self.leases.quietest().find_map(|(from, holder, quiet)| {
-            let ask = self.waiting.first_but(holder)?;
-            Some((from, ask, quiet))
+            let mut asks = self.waiting.iter();
+            let (ask, _) = asks
+                .find(|(_, ask)| ask.worker != holder && self.may_render(ask.worker, quiet.job))?;
+            Some((from, ask, quiet.id))
         })
     }
 
@@ -363,12 +390,7 @@ impl Farm {
         let Delivery { worker, lease, tile, hash, .. } = delivery;
         if self.leases.tiles(lease.job).is_some() && !self.leases.is_granted(worker, lease, tile) {
             let mut actions = vec![Action::Acknowledge(id, Verdict::Rejected)];
-            self.ungranted_count += 1;
-            let count = self.ungranted_count;
-            // Strangers cannot fill the log.
-            if count.is_power_of_two() {
-                actions.push(Action::Log(Notice::NotGranted { delivery, count }));
-            }
+            actions.extend(self.on_ungranted(worker, lease, tile));
             return actions;
         }
         // The worker may have been given up meanwhile.
@@ -394,17 +416,50 @@ impl Farm {
         actions
     }
 
-    /// Event: a worker brought pixels of a tile that make no sense, for that reason.
+    fn on_ungranted(&mut self, worker: WorkerId, lease: LeaseName, tile: TileId) -> Option<Action> {
+        self.ungranted_count += 1;
+        let count = self.ungranted_count;
+        // Strangers cannot fill the log.
+        let is_told = count.is_power_of_two();
+        is_told.then_some(Action::Log(Notice::NotGranted { worker, lease, tile, count }))
+    }
+
+    /// Event: a worker brought pixels of a tile that make no sense, for that reason. The tile, and
+    /// all else that this worker has of the job, goes to others. The job fails when another worker
+    /// had brought such pixels of the tile, or the same one while there was no other.
     pub(crate) fn on_senseless_pixels(
         &mut self,
         worker: WorkerId,
-        job: JobId,
+        lease: LeaseName,
         tile: TileId,
         reason: &str,
+        now: Instant,
     ) -> Vec<Action> {
+        if !self.leases.is_granted(worker, lease, tile) {
+            return self.on_ungranted(worker, lease, tile).into_iter().collect();
+        }
+        let Some(job) = self.jobs.get_mut(&lease.job) else { return Vec::new() };
+        let earlier = job.senseless.insert(tile, (worker, lease.id));
         let mut actions = Vec::new();
-        let reason = format!("worker {worker} rendered tile {}: {reason}", tile.number());
-        self.fail(job, reason, &mut actions);
+        match earlier {
+            // The same delivery, once more.
+            Some(earlier) if earlier == (worker, lease.id) => return actions,
+            Some((other, _)) => {
+                let tile = tile.number();
+                let reason = format!("workers {other} and {worker} rendered tile {tile}: {reason}");
+                self.fail(lease.job, reason, &mut actions);
+            }
+            None => {
+                job.suspects.insert(worker);
+                let (job, reason) = (lease.job, reason.to_owned());
+                actions.push(Action::Log(Notice::Suspect { worker, job, tile, reason }));
+                let losses = self.leases.on_suspicion(worker, job);
+                let reason = "its worker brought pixels that make no sense";
+                let log = |loss| Action::Log(Notice::LeaseLost(loss, reason.to_owned()));
+                actions.extend(losses.into_iter().map(log));
+            }
+        }
+        self.serve(now, &mut actions);
         actions
     }
 
@@ -451,8 +506,15 @@ impl Farm {
     /// [`Farm::number_job`].
     pub(crate) fn on_submit(&mut self, id: JobId, tiles: Tiles, now: Instant) -> Vec<Action> {
         let progress = Progress { tile_count: tiles.grid().count(), ..Progress::default() };
-        let (contributors, storing) = (BTreeSet::new(), BTreeMap::new());
-        self.jobs.insert(id, JobState { started: now, progress, contributors, storing });
+        let job = JobState {
+            started: now,
+            progress,
+            contributors: BTreeSet::new(),
+            suspects: BTreeSet::new(),
+            senseless: BTreeMap::new(),
+            storing: BTreeMap::new(),
+        };
+        self.jobs.insert(id, job);
         self.leases.on_submit(id, tiles);
         let mut actions = Vec::new();
         if self.phase == Phase::Open {
@@ -656,6 +718,13 @@ mod tests {
             (id, actions)
         }
 
+        fn senseless(&mut self, worker: WorkerId, run: &Run) -> Vec<Action> {
+            let (lease, tile) = (run.lease, run.tiles[0]);
+            let actions = self.farm.on_senseless_pixels(worker, lease, tile, "it is NaN", self.now);
+            self.farm.check();
+            actions
+        }
+
         fn store(&mut self, run: &Run) -> Vec<Action> {
             let actions = self.farm.on_stored(run.lease.job, run.tiles[0], self.now);
             self.farm.check();
@@ -845,15 +914,47 @@ mod tests {
     }
 
     #[test]
-    fn pixels_that_make_no_sense_end_the_job_and_say_whose_they_were() {
+    fn pixels_that_make_no_sense_blame_the_worker_and_the_job_when_two_agree() {
         let mut world = World::new();
-        let worker = world.join();
+        let [bad, good, third] = [world.join(), world.join(), world.join()];
         let (job, _) = world.submit(2);
-        let tile = world.farm.tile(job, 1).unwrap();
-        let actions = world.farm.on_senseless_pixels(worker, job, tile, "it is not a number");
-        let reason = "worker 1 rendered tile 1: it is not a number".to_owned();
+        let run = world.lease(bad);
+        let tile = run.tiles[0];
+        // A stranger's say nothing.
+        assert!(world.senseless(good, &run).len() <= 1);
+        let actions = world.senseless(bad, &run);
+        let is_told = |action: &Action| match action {
+            Action::Log(Notice::Suspect { worker, .. }) => *worker == bad,
+            _ => false,
+        };
+        assert!(actions.iter().any(is_told), "{actions:?}");
+        assert!(world.senseless(bad, &run).is_empty(), "a delivery may be repeated");
+        let (ask, actions) = world.ask(bad, 9 * SECOND);
+        assert!(actions.is_empty(), "it gets no more of this job");
+        let other_job = world.submit(1);
+        assert_eq!(answers(&other_job.1)[0].0, ask, "but of another");
+
+        let again = world.lease(good);
+        assert_eq!(again.tiles, [tile]);
+        let actions = world.senseless(good, &again);
+        let reason = format!("workers 1 and 2 rendered tile {}: it is NaN", tile.number());
         assert_eq!(shown(&actions).outcome, Some(Outcome::Failed(reason)));
         assert_eq!(world.farm.tile(job, 1), None);
+        let (_, actions) = world.ask(third, Duration::ZERO);
+        assert!(matches!(answers(&actions)[..], [(_, Ok(Next::Nothing))]));
+    }
+
+    #[test]
+    fn a_worker_that_is_alone_gets_a_tile_again_of_which_it_brought_no_sense() {
+        let mut world = World::new();
+        let worker = world.join();
+        world.submit(1);
+        let run = world.lease(worker);
+        assert_eq!(verdicts(&world.senseless(worker, &run)), []);
+        let again = world.lease(worker);
+        assert_eq!(again.tiles, run.tiles);
+        let actions = world.senseless(worker, &again);
+        assert!(matches!(shown(&actions).outcome, Some(Outcome::Failed(_))), "no wait for ever");
     }
 
     #[test]

@@ -194,7 +194,7 @@ fn take(
         return Err(Status::data_loss("the pixels do not have the hash they came with"));
     }
     if let Err(error) = check_pixels(job.grid.area(tile), &pixels) {
-        shell.report_senseless_pixels(worker, lease.job, tile, &error.to_string());
+        shell.report_senseless_pixels(worker, lease, tile, &error.to_string());
         return Ok(None);
     }
     let delivery = Delivery { worker, lease, tile, hash, seconds: request.seconds, tally };

@@ -278,11 +278,11 @@ impl Shell {
     pub(crate) fn report_senseless_pixels(
         &self,
         worker: WorkerId,
-        job: JobId,
+        lease: LeaseName,
         tile: TileId,
         reason: &str,
     ) {
-        self.tell_farm(|farm, _| farm.on_senseless_pixels(worker, job, tile, reason));
+        self.tell_farm(|farm, now| farm.on_senseless_pixels(worker, lease, tile, reason, now));
     }
 
     pub(crate) fn leave(&self, worker: WorkerId, reason: &str) {
@@ -409,7 +409,7 @@ fn log(notice: Notice) {
             "two copies of a tile differ; one of their workers is broken"
         ),
         Notice::JobFailed(job, reason) => tracing::warn!(job = job.0, reason, "job failed"),
-        Notice::NotGranted { delivery: Delivery { worker, lease, tile, .. }, count } => {
+        Notice::NotGranted { worker, lease, tile, count } => {
             tracing::warn!(
                 worker = worker.0,
                 job = lease.job.0,
@@ -419,6 +419,13 @@ fn log(notice: Notice) {
                 "pixels came that nobody was to render so"
             );
         }
+        Notice::Suspect { worker, job, tile, reason } => tracing::error!(
+            worker = worker.0,
+            job = job.0,
+            tile = tile.number(),
+            reason,
+            "a worker brought pixels that make no sense"
+        ),
         Notice::Strangers(count) => {
             tracing::warn!(count, "calls meant for another start of a coordinator were refused");
         }

@@ -106,6 +106,9 @@ struct World {
     brought: BTreeMap<DeliveryId, PixelHash>,
     /// What clients ordered, and what each job shows: no two the same.
     jobs: BTreeMap<JobId, u8>,
+    /// Tiles of which pixels came that make no sense, and who brought the last.
+    senseless: BTreeMap<(JobId, TileId), WorkerId>,
+    nonsense_count: u32,
     /// Every tile that a worker was to render under a lease.
     granted: BTreeSet<(WorkerId, LeaseName, TileId)>,
     restart_count: u32,
@@ -139,6 +142,8 @@ impl World {
             brought: BTreeMap::new(),
             jobs: BTreeMap::new(),
             granted: BTreeSet::new(),
+            senseless: BTreeMap::new(),
+            nonsense_count: 0,
             restart_count: 0,
             scene_count: 0,
             forgotten: BTreeSet::new(),
@@ -391,6 +396,10 @@ impl World {
         let tally = Tally::default();
         let hash = pixel_hash(scene, tile);
         let delivery = Delivery { worker, lease, tile, hash, seconds: 0.1, tally };
+        if self.random.one_in(200) {
+            self.bring_nonsense(worker, incarnation, lease, tile);
+            return;
+        }
         let copies = [1, 1, 1, 1, 1, 0, 2][self.random.below(7) as usize];
         for _ in 0..copies {
             let is_late = self.random.one_in(10);
@@ -412,6 +421,29 @@ impl World {
             queue.clear();
             *worker = WorkerId(0);
         }
+    }
+
+    /// Pixels that make no sense end a job only if another worker brought such pixels of the tile,
+    /// or there is no other worker.
+    fn bring_nonsense(
+        &mut self,
+        worker: WorkerId,
+        incarnation: Incarnation,
+        lease: LeaseName,
+        tile: TileId,
+    ) {
+        if !self.is_admitted(incarnation) {
+            return;
+        }
+        let actions = self.farm.on_senseless_pixels(worker, lease, tile, "it is NaN", self.now);
+        let ends = actions.iter().any(|action| match action {
+            Action::Publish(_, progress) => progress.outcome.is_some(),
+            _ => false,
+        });
+        let earlier = self.senseless.insert((lease.job, tile), worker);
+        assert!(!ends || earlier.is_some(), "one worker's nonsense ended a job");
+        self.nonsense_count += u32::from(!actions.is_empty());
+        self.act(actions);
     }
 
     /// Renders until every job has ended.
@@ -456,12 +488,13 @@ impl Drop for World {
 
 #[test]
 fn every_job_ends_and_every_tile_is_stitched_once_though_everything_goes_wrong() {
-    let [mut finished, mut failed, mut cancelled, mut restarts] = [0; 4];
+    let [mut finished, mut failed, mut cancelled, mut restarts, mut nonsense] = [0; 5];
     for seed in 0..SEEDS {
         let mut world = World::new(seed);
         world.run();
         world.shut_down();
         restarts += world.restart_count;
+        nonsense += world.nonsense_count;
         assert!(world.picture.values().all(|&count| count == 1));
         for (job, outcome) in &world.outcomes {
             let stored = world.picture.keys().filter(|(stored, _)| stored == job).count();
@@ -478,6 +511,6 @@ fn every_job_ends_and_every_tile_is_stitched_once_though_everything_goes_wrong()
             }
         }
     }
-    let ends = [finished, failed, cancelled, restarts];
+    let ends = [finished, failed, cancelled, restarts, nonsense];
     assert!(ends.iter().all(|&count| count > 20), "each end is met: {ends:?}");
 }

@@ -217,6 +217,9 @@ async fn damaged_and_senseless_pixels_are_refused() {
     assert_eq!(farm.state().await.tiles_done, 0);
 
     assert_eq!(farm.deliver(lease, tiles[0], f32::NAN).await, rejected);
+    assert!(farm.state().await.end.is_none(), "the worker is to blame");
+    let (lease, tiles) = farm.lease().await;
+    assert_eq!(farm.deliver(lease, tiles[0], f32::NAN).await, rejected);
     let Some(End::Failed(reason)) = farm.state().await.end else { panic!("it goes on") };
     assert!(reason.contains("is not a number"), "{reason}");
 }
