@@ -26,6 +26,10 @@ const LONGEST_SILENCE: Duration = LONGEST_WAIT.saturating_mul(6);
 /// Jobs that have ended and are kept for their clients.
 const KEPT_AFTER_END: usize = 16;
 
+/// A tile that takes so many times what others of its job took is rendered a second time before
+/// tiles of later jobs.
+const OVERDUE: u32 = 3;
+
 /// How long workers may take to go home when the coordinator stops.
 const FAREWELL: Duration = Duration::from_millis(1500);
 
@@ -59,6 +63,8 @@ struct JobState {
     started: Instant,
     progress: Progress,
     contributors: BTreeSet<WorkerId>,
+    /// What its tiles took one thread, together; nobody is believed more than the job's age.
+    thread_time: Duration,
     /// Workers that brought pixels that make no sense. They get no more tiles of this job while
     /// there is another worker.
     suspects: BTreeSet<WorkerId>,
@@ -74,6 +80,15 @@ struct Storing {
     first: Delivery,
     /// Copies that came meanwhile. They are answered when the first is safe.
     copies: Vec<DeliveryId>,
+}
+
+/// What there is to do for a worker that waits.
+#[derive(Debug, Clone, Copy)]
+enum Work {
+    /// Free tiles of a job.
+    Free(JobId),
+    /// A tile of a lease that another worker has.
+    Overdue(LeaseId),
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -305,11 +320,16 @@ impl Farm {
     /// longest, then quiet leases are rendered a second time, then the rest may have waited
     /// long enough.
     fn serve(&mut self, now: Instant, actions: &mut Vec<Action>) {
-        while let Some((id, ask, job)) = self.next_work(now) {
+        while let Some((id, ask, work)) = self.next_work(now) {
             self.waiting.remove(id);
-            let threads = self.members.threads(ask.worker);
-            let run = self.leases.on_idle(ask.worker, job, threads, ask.most, now);
-            let run = run.expect("the job has a free tile");
+            let run = match work {
+                Work::Free(job) => {
+                    let threads = self.members.threads(ask.worker);
+                    self.leases.on_idle(ask.worker, job, threads, ask.most, now)
+                }
+                Work::Overdue(lease) => self.leases.on_idle_at_the_end(ask.worker, lease, now),
+            };
+            let run = run.expect("the job has a free tile, or the lease one that is in no other");
             actions.push(Action::Answer(id, Ok(Next::Render(run))));
         }
         while let Some((from, id, quiet)) = self.next_second_rendering()
@@ -329,16 +349,31 @@ impl Farm {
     }
 
     /// What the worker that waits longest of those that may have some gets, while there are free
-    /// tiles: free tiles of the earliest job that has any.
-    fn next_work(&self, now: Instant) -> Option<(AskId, Ask, JobId)> {
+    /// tiles: free tiles of the earliest job that has any, unless one before it has a tile that is
+    /// overdue.
+    fn next_work(&self, now: Instant) -> Option<(AskId, Ask, Work)> {
         if !self.leases.has_free() {
             return None;
         }
         self.waiting.iter().find_map(|(id, ask)| {
-            let mut jobs = self.leases.jobs().filter(|&(_, free_count)| free_count > 0);
-            let (job, _) = jobs.find(|&(job, _)| self.may_render(ask.worker, job))?;
-            Some((id, ask, job))
+            let mut jobs = self.leases.jobs().filter(|&(job, _)| self.may_render(ask.worker, job));
+            let work = jobs.find_map(|(job, free_count)| match free_count {
+                0 => self.overdue(job, ask.worker, now).map(Work::Overdue),
+                _ => Some(Work::Free(job)),
+            });
+            Some((id, ask, work?))
         })
+    }
+
+    /// A lease of another worker whose next tile of `job` should have come long ago.
+    fn overdue(&self, job: JobId, worker: WorkerId, now: Instant) -> Option<LeaseId> {
+        let JobState { thread_time, progress, .. } = self.jobs.get(&job)?;
+        let predicted = thread_time.checked_div(progress.tiles_done)?;
+        let quiet = self.leases.quietest().take_while(|&(from, ..)| from <= now);
+        let mut overdue = quiet.filter(|&(from, holder, lease)| {
+            lease.job == job && holder != worker && from + predicted * OVERDUE <= now
+        });
+        overdue.next().map(|(.., lease)| lease.id)
     }
 
     /// Says whether a worker may have tiles of a job: one under suspicion only if all are.
@@ -473,6 +508,8 @@ impl Farm {
         job.contributors.insert(delivery.worker);
         job.progress.tiles_done = done;
         job.progress.tally.add(&delivery.tally);
+        let thread_time = Duration::try_from_secs_f64(delivery.seconds).unwrap_or_default();
+        job.thread_time += thread_time.min(now - job.started);
         job.progress.worker_count = job.contributors.len() as u32;
         let (progress, elapsed) = (job.progress.clone(), now - job.started);
         let mut actions = vec![Action::Acknowledge(storing.id, Verdict::Accepted)];
@@ -510,6 +547,7 @@ impl Farm {
             started: now,
             progress,
             contributors: BTreeSet::new(),
+            thread_time: Duration::ZERO,
             suspects: BTreeSet::new(),
             senseless: BTreeMap::new(),
             storing: BTreeMap::new(),
@@ -955,6 +993,27 @@ mod tests {
         assert_eq!(again.tiles, run.tiles);
         let actions = world.senseless(worker, &again);
         assert!(matches!(shown(&actions).outcome, Some(Outcome::Failed(_))), "no wait for ever");
+    }
+
+    #[test]
+    fn an_overdue_tile_is_rendered_again_before_a_later_job() {
+        let mut world = World::new();
+        let (stuck, idle) = (world.join(), world.join());
+        let (job, _) = world.submit(3);
+        let first = world.lease(idle);
+        let run = world.lease(stuck);
+        let last = world.lease(idle);
+        // Each takes 0.1 s.
+        world.now += SECOND / 10;
+        world.stitch(idle, &first);
+        world.stitch(idle, &last);
+        let (later, _) = world.submit(9);
+        world.now += Duration::from_millis(550);
+        assert_eq!(world.lease(idle).lease.job, later, "it may still come");
+        world.now += Duration::from_millis(60);
+        let again = world.lease(idle);
+        assert_eq!((again.lease.job, &again.tiles), (job, &run.tiles));
+        assert_eq!(world.lease(idle).lease.job, later, "and only once");
     }
 
     #[test]
