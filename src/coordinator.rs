@@ -44,7 +44,7 @@ pub(crate) async fn run(
         upload_silence: UPLOAD_SILENCE,
         scene_folder: folder.path().to_owned(),
         picture_folder: folder.path().to_owned(),
-    });
+    })?;
     coordinator.run(Listener::Tcp(listener), stop.cancelled()).await?;
     if terminate.is_cancelled() { Ok(()) } else { Err(Failure::Interrupted) }
 }

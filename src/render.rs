@@ -235,7 +235,7 @@ async fn render_with_workers(
         upload_silence: UPLOAD_SILENCE,
         scene_folder: folder.path().to_owned(),
         picture_folder: output.folder(),
-    });
+    })?;
     let job = spawn_blocking({
         let coordinator = coordinator.clone();
         move || coordinator.submit(order)

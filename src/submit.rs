@@ -13,7 +13,7 @@ use anyhow::Context;
 use rtfarm_core::{render::Tally, tile::Size};
 use rtfarm_job::Progress;
 use rtfarm_proto::{
-    Address, CHUNK_BYTES, JobId, MESSAGE_BYTES, PROTOCOL, WireError,
+    Address, CHUNK_BYTES, Incarnation, JobId, MESSAGE_BYTES, PROTOCOL, WireError,
     wire::{self, event, jobs_client::JobsClient, submit_request::Part, submit_response},
 };
 use tokio::{
@@ -58,6 +58,7 @@ pub(crate) async fn run(
         stop,
         text: Some(text),
         client: None,
+        incarnation: Incarnation(0),
         reports: mpsc::channel(1).1,
         running: None,
         writing: None,
@@ -95,6 +96,8 @@ struct Shell<'a> {
     /// The scene's text until it is sent.
     text: Option<SceneText>,
     client: Option<JobsClient<Channel>>,
+    /// The start of the coordinator that took the order.
+    incarnation: Incarnation,
     /// What the running task tells.
     reports: mpsc::Receiver<Report>,
     running: Option<JoinHandle<()>>,
@@ -106,7 +109,7 @@ struct Shell<'a> {
 /// What a task tells.
 enum Report {
     Connected(JobsClient<Channel>),
-    Submitted(Submitted),
+    Submitted(Submitted, Incarnation),
     Watching,
     JobState(JobState),
     ChunkAwaited,
@@ -177,8 +180,9 @@ impl Shell<'_> {
             }
             Action::TellReport(report) => self.console.tell_report(&report),
             Action::Watch(job) => {
+                let request = wire::WatchRequest { job: job.0, incarnation: self.incarnation.0 };
                 let client = self.client();
-                self.start(|reports| watch(client, job, reports));
+                self.start(|reports| watch(client, request, reports));
             }
             Action::Show(state) => self.show(&state),
             Action::WarnOfDifferingTiles(tiles) => {
@@ -190,14 +194,15 @@ impl Shell<'_> {
             }
             Action::Fetch(job) => {
                 let (send, chunks) = mpsc::channel(2);
+                let request = wire::ImageRequest { job: job.0, incarnation: self.incarnation.0 };
                 let client = self.client();
-                let reports = self.start(|reports| fetch(client, job, send, reports));
+                let reports = self.start(|reports| fetch(client, request, send, reports));
                 self.writing = Some(write(self.output.clone(), self.stop.clone(), chunks, reports));
             }
             Action::Cancel(job) => {
                 let mut client = self.client();
+                let request = wire::CancelRequest { job: job.0, incarnation: self.incarnation.0 };
                 self.start(|reports| async move {
-                    let request = wire::CancelRequest { job: job.0 };
                     let cancelled = client.cancel(request).await;
                     let report =
                         cancelled.map_or_else(|status| failed(&status), |_| Report::Cancelled);
@@ -252,7 +257,10 @@ impl Shell<'_> {
                 self.client = Some(client);
                 submission.on_connected(now());
             }
-            Report::Submitted(submitted) => submission.on_submitted(submitted, now()),
+            Report::Submitted(submitted, incarnation) => {
+                self.incarnation = incarnation;
+                submission.on_submitted(submitted, now());
+            }
             Report::Watching => submission.on_watching(),
             Report::JobState(state) => submission.on_job_state(state, now()),
             Report::ChunkAwaited => submission.on_chunk_awaited(now()),
@@ -340,7 +348,7 @@ async fn submit(
     });
     match client.submit(ReceiverStream::new(parts)).await {
         Ok(answer) => match read_submitted(answer.into_inner()) {
-            Ok(submitted) => Report::Submitted(submitted),
+            Ok((submitted, incarnation)) => Report::Submitted(submitted, incarnation),
             Err(error) => nonsense(&error),
         },
         Err(status) => failed(&status),
@@ -348,8 +356,12 @@ async fn submit(
 }
 
 /// Tells of a job until there is nothing more to tell.
-async fn watch(mut client: JobsClient<Channel>, job: JobId, reports: mpsc::Sender<Report>) {
-    let trouble = match client.watch(wire::WatchRequest { job: job.0 }).await {
+async fn watch(
+    mut client: JobsClient<Channel>,
+    request: wire::WatchRequest,
+    reports: mpsc::Sender<Report>,
+) {
+    let trouble = match client.watch(request).await {
         Ok(events) => tell_events(events.into_inner(), &reports).await,
         Err(status) => failed(&status),
     };
@@ -377,11 +389,11 @@ async fn tell_events(mut events: Streaming<wire::Event>, reports: &mpsc::Sender<
 /// Brings a finished job's picture and hands it on, piece by piece.
 async fn fetch(
     mut client: JobsClient<Channel>,
-    job: JobId,
+    request: wire::ImageRequest,
     send: mpsc::Sender<wire::Chunk>,
     reports: mpsc::Sender<Report>,
 ) {
-    let mut chunks = match client.image(wire::ImageRequest { job: job.0 }).await {
+    let mut chunks = match client.image(request).await {
         Ok(chunks) => chunks.into_inner(),
         Err(status) => {
             let _ = reports.send(failed(&status)).await;
@@ -446,15 +458,19 @@ fn nonsense(error: &anyhow::Error) -> Report {
     Report::Trouble(Trouble::Nonsense(format!("{error:#}")))
 }
 
-fn read_submitted(answer: wire::SubmitResponse) -> anyhow::Result<Submitted> {
+fn read_submitted(answer: wire::SubmitResponse) -> anyhow::Result<(Submitted, Incarnation)> {
+    let mut incarnation = Incarnation(0);
     let outcome = match answer.outcome.context("it has no outcome")? {
-        submit_response::Outcome::Accepted(accepted) => SubmitOutcome::Accepted {
-            job: JobId(accepted.job),
-            size: Size::try_from(accepted.frame.ok_or(WireError::Missing("frame"))?)?,
-        },
+        submit_response::Outcome::Accepted(accepted) => {
+            incarnation = Incarnation(accepted.incarnation);
+            SubmitOutcome::Accepted {
+                job: JobId(accepted.job),
+                size: Size::try_from(accepted.frame.ok_or(WireError::Missing("frame"))?)?,
+            }
+        }
         submit_response::Outcome::Refused(reason) => SubmitOutcome::Refused(plain(&reason)),
     };
-    Ok(Submitted { outcome, report: plain(&answer.report) })
+    Ok((Submitted { outcome, report: plain(&answer.report) }, incarnation))
 }
 
 fn read_event(event: wire::Event) -> anyhow::Result<JobState> {

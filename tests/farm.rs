@@ -372,6 +372,51 @@ fn a_farm_over_tcp_gives_the_same_bytes() {
 }
 
 #[test]
+fn a_coordinator_killed_and_started_again_gives_the_next_picture_no_pixel_of_the_last() {
+    let place = Place::new();
+    // The same grid of tiles, other pixels.
+    let other = scene_text().replace("color 230 60 40", "color 40 60 230");
+    fs::write(place.path("other.rt"), other).unwrap();
+    let quick = [&["--samples", "64"], &["--size", "320x240", "--tile", "16"][..]].concat();
+    let render = [&["render", "other.rt", "-o", "here.png", "--workers", "0"], &quick[..]].concat();
+    let mut here = place.start("here.log", &render);
+    assert!(here.wait().success(), "{}", here.log());
+    let listen = ["coordinator", "--listen"];
+    let mut first = place.start("first.log", &[&listen[..], &["127.0.0.1:0"]].concat());
+    let line = first.read_line();
+    let url = line.trim().strip_prefix("listening on ").expect(&line);
+    let worker = ["worker", "--threads", "2", "--patience", "60", "--coordinator", url];
+    let workers = ["a.log", "b.log", "c.log"].map(|log| place.start(log, &worker));
+    let args = [&["submit", "scene.rt", "-o", "out.png", "--coordinator", url], &SLOW[..]].concat();
+    let _lost = place.start("lost.log", &args);
+    poll(|| (first.tiles_done() >= 20 && first.workers().len() == 3).then_some(()));
+    // Each has tiles in hand that it brings once it goes on.
+    for worker in &workers {
+        worker.signal(Signal::STOP);
+    }
+    first.signal(Signal::KILL);
+    first.wait();
+
+    let address = url.strip_prefix("http://").unwrap();
+    let mut second = place.start("second.log", &[&listen[..], &[address]].concat());
+    second.read_line();
+    let args = ["submit", "other.rt", "-o", "next.png", "--coordinator", url];
+    let mut submit = place.start("next.log", &[&args[..], &quick[..]].concat());
+    poll(|| second.log().contains("job started").then_some(()));
+    for worker in &workers {
+        worker.signal(Signal::CONT);
+    }
+    assert!(submit.wait().success(), "{}", submit.log());
+    let expected = fs::read(place.path("here.png")).unwrap();
+    assert!(fs::read(place.path("next.png")).unwrap() == expected, "{}", second.log());
+    second.signal(Signal::TERM);
+    second.wait();
+    for mut worker in workers {
+        assert!(worker.wait().success(), "sent home: {}", worker.log());
+    }
+}
+
+#[test]
 fn an_interrupted_submit_ends_its_job() {
     let place = Place::new();
     let mut coordinator =

@@ -9,9 +9,10 @@ use std::{
 
 use rtfarm_core::{render::Tally, tile::TileId};
 use rtfarm_job::{Outcome, Progress};
-use rtfarm_proto::{JobId, LONGEST_WAIT, LeaseId, LeaseName, WorkerId};
+use rtfarm_proto::{Incarnation, JobId, LONGEST_WAIT, LeaseId, LeaseName, WorkerId};
 
 use crate::{
+    identity::{Identity, Stranger},
     lease::{Leases, Loss, Run},
     members::{Members, NoMember, Process},
     tiles::{Arrival, PixelHash, Tiles},
@@ -25,6 +26,10 @@ const LONGEST_SILENCE: Duration = LONGEST_WAIT.saturating_mul(6);
 /// Jobs that have ended and are kept for their clients.
 const KEPT_AFTER_END: usize = 16;
 
+/// A tile that takes so many times what others of its job took is rendered a second time before
+/// tiles of later jobs.
+const OVERDUE: u32 = 3;
+
 /// How long workers may take to go home when the coordinator stops.
 const FAREWELL: Duration = Duration::from_millis(1500);
 
@@ -36,6 +41,11 @@ const STOPPED: &str = "the coordinator was stopped";
 /// answer.
 #[derive(Debug)]
 pub(crate) struct Farm {
+    identity: Identity,
+    /// Calls that were meant for another incarnation.
+    stranger_count: u64,
+    /// Tiles that came from workers that were never to render them.
+    ungranted_count: u64,
     term: Duration,
     members: Members,
     leases: Leases,
@@ -53,6 +63,13 @@ struct JobState {
     started: Instant,
     progress: Progress,
     contributors: BTreeSet<WorkerId>,
+    /// What its tiles took one thread, together; nobody is believed more than the job's age.
+    thread_time: Duration,
+    /// Workers that brought pixels that make no sense. They get no more tiles of this job while
+    /// there is another worker.
+    suspects: BTreeSet<WorkerId>,
+    /// Tiles of which such pixels came: who brought the last, under which lease.
+    senseless: BTreeMap<TileId, (WorkerId, LeaseId)>,
     storing: BTreeMap<TileId, Storing>,
 }
 
@@ -63,6 +80,15 @@ struct Storing {
     first: Delivery,
     /// Copies that came meanwhile. They are answered when the first is safe.
     copies: Vec<DeliveryId>,
+}
+
+/// What there is to do for a worker that waits.
+#[derive(Debug, Clone, Copy)]
+enum Work {
+    /// Free tiles of a job.
+    Free(JobId),
+    /// A tile of a lease that another worker has.
+    Overdue(LeaseId),
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -109,7 +135,7 @@ pub(crate) enum Verdict {
     Accepted,
     /// Earlier pixels of the tile are in the picture.
     Duplicate,
-    /// The job is over.
+    /// The job is over, or the worker was never to render the tile.
     Rejected,
 }
 
@@ -151,19 +177,29 @@ pub(crate) enum Notice {
     JobFailed(JobId, String),
     /// A client cancelled a job.
     JobCancelled(JobId),
+    /// Pixels came of a tile that their worker was never to render under that lease, as the last of
+    /// so many.
+    NotGranted { worker: WorkerId, lease: LeaseName, tile: TileId, count: u64 },
+    /// A worker brought pixels that make no sense, for that reason.
+    Suspect { worker: WorkerId, job: JobId, tile: TileId, reason: String },
+    /// So many calls were refused, since they were meant for another incarnation.
+    Strangers(u64),
 }
 
 impl Farm {
     /// Makes a farm without members and jobs. A lease lives for `term` after the last progress.
-    pub(crate) fn new(term: Duration) -> Self {
+    pub(crate) fn new(identity: Identity, term: Duration) -> Self {
         Self {
+            identity,
+            stranger_count: 0,
+            ungranted_count: 0,
             term,
             members: Members::new(LONGEST_SILENCE.max(term)),
             leases: Leases::new(term),
             waiting: Waiting::default(),
             jobs: BTreeMap::new(),
             ended: VecDeque::new(),
-            last_job: JobId(0),
+            last_job: identity.job_before_first(),
             phase: Phase::Open,
         }
     }
@@ -192,6 +228,22 @@ impl Farm {
         self.serve(now, &mut actions);
         self.end_farewell(now, &mut actions);
         actions
+    }
+
+    /// Event: a call comes that is neither to join nor to submit. What it asks for may be done only
+    /// if it is meant for this incarnation.
+    pub(crate) fn on_call(
+        &mut self,
+        incarnation: Incarnation,
+    ) -> (Result<(), Stranger>, Vec<Action>) {
+        if incarnation == self.identity.incarnation {
+            return (Ok(()), Vec::new());
+        }
+        self.stranger_count += 1;
+        // Strangers cannot fill the log.
+        let is_told = self.stranger_count.is_power_of_two();
+        let told = is_told.then_some(Action::Log(Notice::Strangers(self.stranger_count)));
+        (Err(Stranger), told.into_iter().collect())
     }
 
     // Members.
@@ -268,13 +320,16 @@ impl Farm {
     /// longest, then quiet leases are rendered a second time, then the rest may have waited
     /// long enough.
     fn serve(&mut self, now: Instant, actions: &mut Vec<Action>) {
-        while let Some((id, ask)) = self.waiting.first()
-            && let Some(run) = {
-                let threads = self.members.threads(ask.worker);
-                self.leases.on_idle(ask.worker, threads, ask.most, now)
-            }
-        {
+        while let Some((id, ask, work)) = self.next_work(now) {
             self.waiting.remove(id);
+            let run = match work {
+                Work::Free(job) => {
+                    let threads = self.members.threads(ask.worker);
+                    self.leases.on_idle(ask.worker, job, threads, ask.most, now)
+                }
+                Work::Overdue(lease) => self.leases.on_idle_at_the_end(ask.worker, lease, now),
+            };
+            let run = run.expect("the job has a free tile, or the lease one that is in no other");
             actions.push(Action::Answer(id, Ok(Next::Render(run))));
         }
         while let Some((from, id, quiet)) = self.next_second_rendering()
@@ -293,13 +348,50 @@ impl Farm {
         }
     }
 
+    /// What the worker that waits longest of those that may have some gets, while there are free
+    /// tiles: free tiles of the earliest job that has any, unless one before it has a tile that is
+    /// overdue.
+    fn next_work(&self, now: Instant) -> Option<(AskId, Ask, Work)> {
+        if !self.leases.has_free() {
+            return None;
+        }
+        self.waiting.iter().find_map(|(id, ask)| {
+            let mut jobs = self.leases.jobs().filter(|&(job, _)| self.may_render(ask.worker, job));
+            let work = jobs.find_map(|(job, free_count)| match free_count {
+                0 => self.overdue(job, ask.worker, now).map(Work::Overdue),
+                _ => Some(Work::Free(job)),
+            });
+            Some((id, ask, work?))
+        })
+    }
+
+    /// A lease of another worker whose next tile of `job` should have come long ago.
+    fn overdue(&self, job: JobId, worker: WorkerId, now: Instant) -> Option<LeaseId> {
+        let JobState { thread_time, progress, .. } = self.jobs.get(&job)?;
+        let predicted = thread_time.checked_div(progress.tiles_done)?;
+        let quiet = self.leases.quietest().take_while(|&(from, ..)| from <= now);
+        let mut overdue = quiet.filter(|&(from, holder, lease)| {
+            lease.job == job && holder != worker && from + predicted * OVERDUE <= now
+        });
+        overdue.next().map(|(.., lease)| lease.id)
+    }
+
+    /// Says whether a worker may have tiles of a job: one under suspicion only if all are.
+    fn may_render(&self, worker: WorkerId, job: JobId) -> bool {
+        self.jobs.get(&job).is_none_or(|JobState { suspects, .. }| {
+            !suspects.contains(&worker) || self.members.all(|member| suspects.contains(&member))
+        })
+    }
+
     /// From when on which waiting question can be answered with a tile of which quiet lease.
     fn next_second_rendering(&self) -> Option<(Instant, AskId, LeaseId)> {
         self.waiting.first()?;
         // With two that wait, the first lease will do; with one, all but its own.
         self.leases.quietest().find_map(|(from, holder, quiet)| {
-            let ask = self.waiting.first_but(holder)?;
-            Some((from, ask, quiet))
+            let mut asks = self.waiting.iter();
+            let (ask, _) = asks
+                .find(|(_, ask)| ask.worker != holder && self.may_render(ask.worker, quiet.job))?;
+            Some((from, ask, quiet.id))
         })
     }
 
@@ -322,7 +414,8 @@ impl Farm {
         self.leases.tiles(job)?.grid().tile(number)
     }
 
-    /// Event: pixels came. The first of a tile are stored, and acknowledged when that is done.
+    /// Event: pixels came. The first of a tile are stored, and acknowledged when that is done. They
+    /// are taken only from a worker that was to render the tile under that lease, however late.
     pub(crate) fn on_pixels(
         &mut self,
         id: DeliveryId,
@@ -330,7 +423,12 @@ impl Farm {
         now: Instant,
     ) -> Vec<Action> {
         let Delivery { worker, lease, tile, hash, .. } = delivery;
-        // Pixels are welcome from anyone: a worker may have been given up meanwhile.
+        if self.leases.tiles(lease.job).is_some() && !self.leases.is_granted(worker, lease, tile) {
+            let mut actions = vec![Action::Acknowledge(id, Verdict::Rejected)];
+            actions.extend(self.on_ungranted(worker, lease, tile));
+            return actions;
+        }
+        // The worker may have been given up meanwhile.
         let _ = self.members.on_sign_of_life(worker, now);
         let arrival = self.leases.on_pixels(worker, lease, tile, hash, now);
         let (Some(arrival), Some(job)) = (arrival, self.jobs.get_mut(&lease.job)) else {
@@ -353,17 +451,50 @@ impl Farm {
         actions
     }
 
-    /// Event: a worker brought pixels of a tile that make no sense, for that reason.
+    fn on_ungranted(&mut self, worker: WorkerId, lease: LeaseName, tile: TileId) -> Option<Action> {
+        self.ungranted_count += 1;
+        let count = self.ungranted_count;
+        // Strangers cannot fill the log.
+        let is_told = count.is_power_of_two();
+        is_told.then_some(Action::Log(Notice::NotGranted { worker, lease, tile, count }))
+    }
+
+    /// Event: a worker brought pixels of a tile that make no sense, for that reason. The tile, and
+    /// all else that this worker has of the job, goes to others. The job fails when another worker
+    /// had brought such pixels of the tile, or the same one while there was no other.
     pub(crate) fn on_senseless_pixels(
         &mut self,
         worker: WorkerId,
-        job: JobId,
+        lease: LeaseName,
         tile: TileId,
         reason: &str,
+        now: Instant,
     ) -> Vec<Action> {
+        if !self.leases.is_granted(worker, lease, tile) {
+            return self.on_ungranted(worker, lease, tile).into_iter().collect();
+        }
+        let Some(job) = self.jobs.get_mut(&lease.job) else { return Vec::new() };
+        let earlier = job.senseless.insert(tile, (worker, lease.id));
         let mut actions = Vec::new();
-        let reason = format!("worker {worker} rendered tile {}: {reason}", tile.number());
-        self.fail(job, reason, &mut actions);
+        match earlier {
+            // The same delivery, once more.
+            Some(earlier) if earlier == (worker, lease.id) => return actions,
+            Some((other, _)) => {
+                let tile = tile.number();
+                let reason = format!("workers {other} and {worker} rendered tile {tile}: {reason}");
+                self.fail(lease.job, reason, &mut actions);
+            }
+            None => {
+                job.suspects.insert(worker);
+                let (job, reason) = (lease.job, reason.to_owned());
+                actions.push(Action::Log(Notice::Suspect { worker, job, tile, reason }));
+                let losses = self.leases.on_suspicion(worker, job);
+                let reason = "its worker brought pixels that make no sense";
+                let log = |loss| Action::Log(Notice::LeaseLost(loss, reason.to_owned()));
+                actions.extend(losses.into_iter().map(log));
+            }
+        }
+        self.serve(now, &mut actions);
         actions
     }
 
@@ -377,6 +508,8 @@ impl Farm {
         job.contributors.insert(delivery.worker);
         job.progress.tiles_done = done;
         job.progress.tally.add(&delivery.tally);
+        let thread_time = Duration::try_from_secs_f64(delivery.seconds).unwrap_or_default();
+        job.thread_time += thread_time.min(now - job.started);
         job.progress.worker_count = job.contributors.len() as u32;
         let (progress, elapsed) = (job.progress.clone(), now - job.started);
         let mut actions = vec![Action::Acknowledge(storing.id, Verdict::Accepted)];
@@ -410,8 +543,16 @@ impl Farm {
     /// [`Farm::number_job`].
     pub(crate) fn on_submit(&mut self, id: JobId, tiles: Tiles, now: Instant) -> Vec<Action> {
         let progress = Progress { tile_count: tiles.grid().count(), ..Progress::default() };
-        let (contributors, storing) = (BTreeSet::new(), BTreeMap::new());
-        self.jobs.insert(id, JobState { started: now, progress, contributors, storing });
+        let job = JobState {
+            started: now,
+            progress,
+            contributors: BTreeSet::new(),
+            thread_time: Duration::ZERO,
+            suspects: BTreeSet::new(),
+            senseless: BTreeMap::new(),
+            storing: BTreeMap::new(),
+        };
+        self.jobs.insert(id, job);
         self.leases.on_submit(id, tiles);
         let mut actions = Vec::new();
         if self.phase == Phase::Open {
@@ -514,6 +655,11 @@ impl Farm {
 
 #[cfg(test)]
 impl Farm {
+    /// Which start of the farm this is.
+    pub(crate) fn incarnation(&self) -> Incarnation {
+        self.identity.incarnation
+    }
+
     /// Checks every invariant, at the price of a scan.
     pub(crate) fn check(&self) {
         let is_member = |worker| self.members.contains(worker);
@@ -552,7 +698,8 @@ mod tests {
         fn new() -> Self {
             #[expect(clippy::disallowed_methods, reason = "any instant will do")]
             let now = Instant::now();
-            Self { farm: Farm::new(TERM), now, last_number: 0 }
+            let identity = Identity::from_random([1; 24]);
+            Self { farm: Farm::new(identity, TERM), now, last_number: 0 }
         }
 
         fn number(&mut self) -> u64 {
@@ -609,6 +756,13 @@ mod tests {
             (id, actions)
         }
 
+        fn senseless(&mut self, worker: WorkerId, run: &Run) -> Vec<Action> {
+            let (lease, tile) = (run.lease, run.tiles[0]);
+            let actions = self.farm.on_senseless_pixels(worker, lease, tile, "it is NaN", self.now);
+            self.farm.check();
+            actions
+        }
+
         fn store(&mut self, run: &Run) -> Vec<Action> {
             let actions = self.farm.on_stored(run.lease.job, run.tiles[0], self.now);
             self.farm.check();
@@ -663,6 +817,32 @@ mod tests {
     }
 
     #[test]
+    fn a_call_meant_for_another_incarnation_is_refused_and_counted() {
+        let mut world = World::new();
+        let ours = world.farm.incarnation();
+        assert!(matches!(world.farm.on_call(ours), (Ok(()), actions) if actions.is_empty()));
+        let mut told = Vec::new();
+        for _ in 0..5 {
+            let (admitted, actions) = world.farm.on_call(Incarnation(ours.0 + 1));
+            assert_eq!(admitted, Err(Stranger));
+            told.extend(actions.into_iter().map(|action| match action {
+                Action::Log(Notice::Strangers(count)) => count,
+                other => panic!("{other:?}"),
+            }));
+        }
+        assert_eq!(told, [1, 2, 4], "strangers cannot fill the log");
+    }
+
+    #[test]
+    fn incarnations_number_their_jobs_differently() {
+        let identities = [[1; 24], [2; 24]].map(Identity::from_random);
+        let mut farms = identities.map(|identity| Farm::new(identity, TERM));
+        let numbers: BTreeSet<JobId> =
+            farms.iter_mut().flat_map(|farm| [farm.number_job(), farm.number_job()]).collect();
+        assert_eq!(numbers.len(), 4);
+    }
+
+    #[test]
     fn a_tile_counts_and_is_acknowledged_when_it_is_stored() {
         let mut world = World::new();
         let worker = world.join();
@@ -708,6 +888,40 @@ mod tests {
     }
 
     #[test]
+    fn pixels_are_taken_only_from_a_worker_that_was_to_render_them_under_that_lease() {
+        let mut world = World::new();
+        let (worker, other) = (world.join(), world.join());
+        let (job, _) = world.submit(2);
+        let (first, second) = (world.lease(worker), world.lease(worker));
+        let with = |lease, tile: TileId| Run { lease, tiles: vec![tile] };
+        let no_lease = LeaseName { job, id: LeaseId(99) };
+        for (from, run) in [
+            (other, first.clone()),
+            (WorkerId(77), first.clone()),
+            (worker, with(first.lease, second.tiles[0])),
+            (worker, with(no_lease, first.tiles[0])),
+        ] {
+            let (id, actions) = world.deliver(from, &run, 9);
+            assert_eq!(verdicts(&actions), [(id, Verdict::Rejected)], "{from} {run:?}");
+        }
+        // However late, and though the worker is no member any more.
+        world.pass(LONGEST_SILENCE * 2);
+        assert!(!world.farm.members.contains(worker));
+        let actions = world.stitch(worker, &first);
+        assert_eq!(shown(&actions).tiles_done, 1);
+        let mut told = Vec::new();
+        for _ in 0..5 {
+            told.extend(world.deliver(other, &second, 9).1.into_iter().filter_map(|action| {
+                match action {
+                    Action::Log(Notice::NotGranted { count, .. }) => Some(count),
+                    _ => None,
+                }
+            }));
+        }
+        assert_eq!(told, [8], "strangers cannot fill the log");
+    }
+
+    #[test]
     fn a_picture_that_cannot_be_written_ends_its_job() {
         let mut world = World::new();
         let worker = world.join();
@@ -738,15 +952,68 @@ mod tests {
     }
 
     #[test]
-    fn pixels_that_make_no_sense_end_the_job_and_say_whose_they_were() {
+    fn pixels_that_make_no_sense_blame_the_worker_and_the_job_when_two_agree() {
         let mut world = World::new();
-        let worker = world.join();
+        let [bad, good, third] = [world.join(), world.join(), world.join()];
         let (job, _) = world.submit(2);
-        let tile = world.farm.tile(job, 1).unwrap();
-        let actions = world.farm.on_senseless_pixels(worker, job, tile, "it is not a number");
-        let reason = "worker 1 rendered tile 1: it is not a number".to_owned();
+        let run = world.lease(bad);
+        let tile = run.tiles[0];
+        // A stranger's say nothing.
+        assert!(world.senseless(good, &run).len() <= 1);
+        let actions = world.senseless(bad, &run);
+        let is_told = |action: &Action| match action {
+            Action::Log(Notice::Suspect { worker, .. }) => *worker == bad,
+            _ => false,
+        };
+        assert!(actions.iter().any(is_told), "{actions:?}");
+        assert!(world.senseless(bad, &run).is_empty(), "a delivery may be repeated");
+        let (ask, actions) = world.ask(bad, 9 * SECOND);
+        assert!(actions.is_empty(), "it gets no more of this job");
+        let other_job = world.submit(1);
+        assert_eq!(answers(&other_job.1)[0].0, ask, "but of another");
+
+        let again = world.lease(good);
+        assert_eq!(again.tiles, [tile]);
+        let actions = world.senseless(good, &again);
+        let reason = format!("workers 1 and 2 rendered tile {}: it is NaN", tile.number());
         assert_eq!(shown(&actions).outcome, Some(Outcome::Failed(reason)));
         assert_eq!(world.farm.tile(job, 1), None);
+        let (_, actions) = world.ask(third, Duration::ZERO);
+        assert!(matches!(answers(&actions)[..], [(_, Ok(Next::Nothing))]));
+    }
+
+    #[test]
+    fn a_worker_that_is_alone_gets_a_tile_again_of_which_it_brought_no_sense() {
+        let mut world = World::new();
+        let worker = world.join();
+        world.submit(1);
+        let run = world.lease(worker);
+        assert_eq!(verdicts(&world.senseless(worker, &run)), []);
+        let again = world.lease(worker);
+        assert_eq!(again.tiles, run.tiles);
+        let actions = world.senseless(worker, &again);
+        assert!(matches!(shown(&actions).outcome, Some(Outcome::Failed(_))), "no wait for ever");
+    }
+
+    #[test]
+    fn an_overdue_tile_is_rendered_again_before_a_later_job() {
+        let mut world = World::new();
+        let (stuck, idle) = (world.join(), world.join());
+        let (job, _) = world.submit(3);
+        let first = world.lease(idle);
+        let run = world.lease(stuck);
+        let last = world.lease(idle);
+        // Each takes 0.1 s.
+        world.now += SECOND / 10;
+        world.stitch(idle, &first);
+        world.stitch(idle, &last);
+        let (later, _) = world.submit(9);
+        world.now += Duration::from_millis(550);
+        assert_eq!(world.lease(idle).lease.job, later, "it may still come");
+        world.now += Duration::from_millis(60);
+        let again = world.lease(idle);
+        assert_eq!((again.lease.job, &again.tiles), (job, &run.tiles));
+        assert_eq!(world.lease(idle).lease.job, later, "and only once");
     }
 
     #[test]

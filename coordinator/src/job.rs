@@ -3,7 +3,7 @@
 use rtfarm_core::{render::Settings, tile::TileGrid};
 use rtfarm_job::Progress;
 use rtfarm_picture::Picture;
-use rtfarm_proto::JobId;
+use rtfarm_proto::{JobId, TileHasher};
 use tokio::sync::watch;
 
 use crate::store::SceneFile;
@@ -15,6 +15,8 @@ pub struct Job {
     pub(crate) scene: SceneFile,
     pub(crate) settings: Settings,
     pub(crate) grid: TileGrid,
+    /// Hashes its tiles' pixels as workers do.
+    pub(crate) hasher: TileHasher,
     pub(crate) picture: Picture,
     pub(crate) progress: watch::Sender<Progress>,
 }

@@ -38,6 +38,16 @@ pub(crate) struct Leases {
     last_tiles: BTreeSet<(Instant, LeaseId)>,
     by_worker: BTreeSet<(WorkerId, LeaseId)>,
     by_job: BTreeSet<(JobId, LeaseId)>,
+    /// Every lease that was ever given of these jobs, and what it covered.
+    granted: BTreeMap<JobId, BTreeMap<LeaseId, Grant>>,
+}
+
+/// Who may bring which tiles under a lease, even after its end.
+#[derive(Debug)]
+struct Grant {
+    worker: WorkerId,
+    /// In ascending order.
+    tiles: Box<[TileId]>,
 }
 
 #[derive(Debug)]
@@ -82,6 +92,7 @@ impl Leases {
             last_tiles: BTreeSet::new(),
             by_worker: BTreeSet::new(),
             by_job: BTreeSet::new(),
+            granted: BTreeMap::new(),
         }
     }
 
@@ -95,11 +106,23 @@ impl Leases {
         self.expiries.first().map(|&(until, _)| until)
     }
 
-    /// Leases of which a tile may be rendered a second time, the quietest first: from when on, and
-    /// whose it is.
-    pub(crate) fn quietest(&self) -> impl Iterator<Item = (Instant, WorkerId, LeaseId)> {
-        let of = |&(last_tile, id)| (last_tile + QUIET, self.held[&id].worker, id);
-        self.last_tiles.iter().map(of)
+    /// Leases of which a tile may be rendered a second time, the quietest first: from when on,
+    /// whose it is and of which job.
+    pub(crate) fn quietest(&self) -> impl Iterator<Item = (Instant, WorkerId, LeaseName)> {
+        self.last_tiles.iter().map(|&(last_tile, id)| {
+            let Lease { worker, job, .. } = self.held[&id];
+            (last_tile + QUIET, worker, LeaseName { job, id })
+        })
+    }
+
+    /// The jobs that are being rendered, the earliest first, and how many free tiles each has.
+    pub(crate) fn jobs(&self) -> impl Iterator<Item = (JobId, usize)> {
+        self.jobs.iter().map(|(&job, tiles)| (job, tiles.free_count()))
+    }
+
+    /// Says whether any job has a free tile.
+    pub(crate) fn has_free(&self) -> bool {
+        !self.with_free.is_empty()
     }
 
     /// Event: a job is to be rendered, of which all tiles are free.
@@ -117,19 +140,20 @@ impl Leases {
         }
         self.jobs.remove(&job);
         self.with_free.remove(&job);
+        self.granted.remove(&job);
     }
 
     /// Event: `worker`, with `threads` of the farm's `all_threads`, would render up to `most` free
-    /// tiles. It gets some of the earliest job that has any.
+    /// tiles of `job`. `None` when that has none.
     pub(crate) fn on_idle(
         &mut self,
         worker: WorkerId,
+        job: JobId,
         (threads, all_threads): (usize, usize),
         most: usize,
         now: Instant,
     ) -> Option<Run> {
-        let &job = self.with_free.first()?;
-        let tiles = self.jobs.get_mut(&job)?;
+        let tiles = self.jobs.get_mut(&job).filter(|tiles| tiles.free_count() > 0)?;
         let shared_out = tiles.free_count() * threads / (RUNS_PER_THREAD * all_threads.max(1));
         let count = shared_out.clamp(1, LONGEST_RUN).min(most.max(1));
         self.last_id.0 += 1;
@@ -174,6 +198,9 @@ impl Leases {
             lease: LeaseName { job, id },
             tiles: tiles.at(if alone.is_empty() { &shared } else { &alone }),
         };
+        let mut granted: Box<[TileId]> = run.tiles.as_slice().into();
+        granted.sort_unstable();
+        self.granted.entry(job).or_default().insert(id, Grant { worker, tiles: granted });
         let until = now + self.term;
         self.expiries.insert((until, id));
         self.by_worker.insert((worker, id));
@@ -198,8 +225,15 @@ impl Leases {
         }
     }
 
-    /// Event: pixels of `tile` came from `worker`. Tiles are deterministic: the first copy wins,
-    /// however late and whoever sent it. `None` when the job is over.
+    /// Says whether `worker` was ever to render `tile` under a lease of a job that has not ended.
+    pub(crate) fn is_granted(&self, worker: WorkerId, name: LeaseName, tile: TileId) -> bool {
+        let grant = self.granted.get(&name.job).and_then(|granted| granted.get(&name.id));
+        grant
+            .is_some_and(|grant| grant.worker == worker && grant.tiles.binary_search(&tile).is_ok())
+    }
+
+    /// Event: pixels of `tile` came from `worker`, which was granted it. Tiles are deterministic:
+    /// the first copy wins, however late. `None` when the job is over.
     pub(crate) fn on_pixels(
         &mut self,
         worker: WorkerId,
@@ -273,6 +307,14 @@ impl Leases {
         lost.into_iter().filter_map(|id| self.lose(id)).collect()
     }
 
+    /// Event: `worker` is to render no tile of `job` that it has not brought.
+    pub(crate) fn on_suspicion(&mut self, worker: WorkerId, job: JobId) -> Vec<Loss> {
+        let of_worker = (worker, LeaseId(0))..=(worker, LeaseId(u64::MAX));
+        let leases = self.by_worker.range(of_worker).map(|&(_, id)| id);
+        let lost: Vec<LeaseId> = leases.filter(|id| self.held[id].job == job).collect();
+        lost.into_iter().filter_map(|id| self.lose(id)).collect()
+    }
+
     fn lose(&mut self, id: LeaseId) -> Option<Loss> {
         let Lease { job, worker, alone, shared, .. } = self.remove(id)?;
         let tiles = self.jobs.get_mut(&job)?;
@@ -328,16 +370,19 @@ impl Leases {
         assert!(self.expiries == leases().map(|(&id, lease)| (lease.until, id)).collect());
         assert!(self.by_worker == leases().map(|(&id, lease)| (lease.worker, id)).collect());
         assert!(self.by_job == leases().map(|(&id, lease)| (lease.job, id)).collect());
+        assert!(self.granted.keys().all(|job| self.jobs.contains_key(job)));
+        for (id, lease) in &self.held {
+            let places = lease.alone.union(&lease.shared).copied().collect();
+            for tile in self.jobs[&lease.job].at(&places) {
+                assert!(self.is_granted(lease.worker, LeaseName { job: lease.job, id: *id }, tile));
+            }
+        }
         let alone = leases().filter(|(_, lease)| !lease.alone.is_empty());
         assert!(self.last_tiles == alone.map(|(&id, lease)| (lease.last_tile, id)).collect());
     }
 
     fn is_empty(&self) -> bool {
         self.held.is_empty()
-    }
-
-    fn has_free(&self) -> bool {
-        !self.with_free.is_empty()
     }
 }
 
@@ -369,7 +414,7 @@ mod tests {
     /// A job of a row of tiles, of which the first worker has leased all under lease 1.
     fn all_leased(tile_count: u64) -> (Leases, Vec<TileId>, Instant) {
         let (mut leases, start) = job(tile_count, 1);
-        let run = leases.on_idle(A, (8, 1), 64, start).unwrap();
+        let run = leases.on_idle(A, JOB, (8, 1), 64, start).unwrap();
         assert_eq!((run.lease, run.tiles.len() as u64), (lease(1), tile_count));
         assert!(!leases.has_free());
         (leases, run.tiles, start)
@@ -386,7 +431,7 @@ mod tests {
     /// From when on `worker` may render a tile of the quietest lease of others again.
     fn quiet_for(leases: &Leases, worker: WorkerId) -> Option<(Instant, LeaseId)> {
         let mut others = leases.quietest().filter(|&(_, holder, _)| holder != worker);
-        others.next().map(|(from, _, id)| (from, id))
+        others.next().map(|(from, _, name)| (from, name.id))
     }
 
     #[test]
@@ -403,7 +448,7 @@ mod tests {
         assert_eq!(lost, [Loss { lease: lease(1), worker: A, tiles: rest.clone() }]);
         leases.check(|_| true);
         assert!(!leases.on_progress(A, lease(1), start + TERM * 2));
-        let run = leases.on_idle(B, (8, 1), 64, start + TERM * 2).unwrap();
+        let run = leases.on_idle(B, JOB, (8, 1), 64, start + TERM * 2).unwrap();
         assert_eq!(run.tiles, rest);
     }
 
@@ -420,7 +465,7 @@ mod tests {
         let (mut leases, tiles, start) = all_leased(2);
         leases.on_worker_lost(A);
         deliver(&mut leases, A, 1, tiles[0], start);
-        let run = leases.on_idle(B, (8, 1), 64, start).unwrap();
+        let run = leases.on_idle(B, JOB, (8, 1), 64, start).unwrap();
         assert_eq!(run.tiles, tiles[1..]);
     }
 
@@ -483,9 +528,10 @@ mod tests {
     #[test]
     fn runs_shorten_towards_the_end() {
         let (mut leases, start) = job(100, 10);
-        let lengths: Vec<usize> = std::iter::from_fn(|| leases.on_idle(A, (1, 4), 1000, start))
-            .map(|run| run.tiles.len())
-            .collect();
+        let lengths: Vec<usize> =
+            std::iter::from_fn(|| leases.on_idle(A, JOB, (1, 4), 1000, start))
+                .map(|run| run.tiles.len())
+                .collect();
         assert!(lengths.is_sorted_by(|a, b| a >= b), "{lengths:?}");
         assert_eq!(lengths[0], LONGEST_RUN);
         assert_eq!(lengths.last(), Some(&1));

@@ -7,12 +7,13 @@
 //! knows only what stands before it:
 //!
 //! ```text
-//! tiles <- lease, members, waiting <- farm, store, job <- shell <- service <- run
+//! identity, tiles <- lease, members, waiting <- farm, store, job <- shell <- service <- run
 //! accept <- run
 //! ```
 
 mod accept;
 mod farm;
+mod identity;
 mod job;
 mod lease;
 mod members;

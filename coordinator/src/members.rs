@@ -143,6 +143,11 @@ impl Members {
         self.by_process.range(of_process).next().map(|&(_, worker)| worker)
     }
 
+    /// Says whether something is true of every member.
+    pub(crate) fn all(&self, is_true: impl Fn(WorkerId) -> bool) -> bool {
+        self.by_id.keys().all(|&worker| is_true(worker))
+    }
+
     /// Says whether there is nobody.
     pub(crate) fn is_empty(&self) -> bool {
         self.by_id.is_empty()

@@ -20,6 +20,7 @@ use tonic::transport::server::{Connected, Router};
 
 use crate::{
     accept::{WAITING, accept_all},
+    identity::Identity,
     job::Job,
     service,
     shell::{Config, Shell, SubmitError},
@@ -44,9 +45,11 @@ pub enum Listener {
 const CLOSING: Duration = Duration::from_millis(1500);
 
 impl Coordinator {
-    /// Makes a coordinator without jobs and workers.
-    pub fn new(config: Config) -> Self {
-        Self { shell: Arc::new(Shell::new(config)) }
+    /// Makes a coordinator without jobs and workers, and draws its identity.
+    pub fn new(config: Config) -> io::Result<Self> {
+        let mut random = [0; 24];
+        rustix::rand::getrandom(&mut random, rustix::rand::GetRandomFlags::empty())?;
+        Ok(Self { shell: Arc::new(Shell::new(config, Identity::from_random(random))) })
     }
 
     /// Takes an order. This writes files: never call it on the async runtime.

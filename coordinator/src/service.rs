@@ -36,6 +36,7 @@ use tonic::{
 
 use crate::{
     farm::{Delivery, Next, Verdict},
+    identity::Stranger,
     job::Job,
     lease::Run,
     members::{NoMember, Process},
@@ -86,7 +87,12 @@ impl farm_server::Farm for FarmService {
         let threads = threads as usize;
         let worker = self.shell.join(Process { nonce, number: process, threads, host, isa });
         let term_ms = u32::try_from(self.shell.config.term.as_millis()).unwrap_or(u32::MAX);
-        Ok(Response::new(wire::JoinResponse { worker: worker.0, term_ms }))
+        Ok(Response::new(wire::JoinResponse {
+            worker: worker.0,
+            term_ms,
+            farm: self.shell.identity.farm.0.to_vec().into(),
+            incarnation: self.shell.identity.incarnation.0,
+        }))
     }
 
     async fn lease(
@@ -94,7 +100,8 @@ impl farm_server::Farm for FarmService {
         request: Request<wire::LeaseRequest>,
     ) -> Result<Response<wire::LeaseResponse>, Status> {
         let is_local = request.extensions().get::<UdsConnectInfo>().is_some();
-        let wire::LeaseRequest { worker, max_tiles, wait_ms } = request.into_inner();
+        let wire::LeaseRequest { worker, max_tiles, wait_ms, incarnation } = request.into_inner();
+        self.shell.admit(incarnation).map_err(stranger)?;
         let wait = Duration::from_millis(wait_ms.into()).min(LONGEST_WAIT);
         let next = self.shell.ask(WorkerId(worker), max_tiles as usize, wait).await;
         let next = match next.map_err(no_member)? {
@@ -115,7 +122,8 @@ impl farm_server::Farm for FarmService {
         &self,
         request: Request<wire::RenewRequest>,
     ) -> Result<Response<wire::RenewResponse>, Status> {
-        let wire::RenewRequest { worker, leases } = request.into_inner();
+        let wire::RenewRequest { worker, leases, incarnation } = request.into_inner();
+        self.shell.admit(incarnation).map_err(stranger)?;
         let leases: Vec<LeaseName> = leases.into_iter().map(LeaseName::from).collect();
         let lost = self.shell.renew(WorkerId(worker), &leases).map_err(no_member)?;
         let lost = lost.into_iter().map(Into::into).collect();
@@ -128,6 +136,7 @@ impl farm_server::Farm for FarmService {
     ) -> Result<Response<wire::DeliverResponse>, Status> {
         let shell = Arc::clone(&self.shell);
         let delivery = request.into_inner();
+        self.shell.admit(delivery.incarnation).map_err(stranger)?;
         let (worker, tile) = (delivery.worker, delivery.tile);
         let verdict = match blocking(move || take(&shell, &delivery)).await? {
             Some(verdict) => verdict.await.expect("every delivery is answered"),
@@ -146,7 +155,8 @@ impl farm_server::Farm for FarmService {
         &self,
         request: Request<wire::LeaveRequest>,
     ) -> Result<Response<wire::LeaveResponse>, Status> {
-        let wire::LeaveRequest { worker, reason } = request.into_inner();
+        let wire::LeaveRequest { worker, reason, incarnation } = request.into_inner();
+        self.shell.admit(incarnation).map_err(stranger)?;
         self.shell.leave(WorkerId(worker), &reason);
         Ok(Response::new(wire::LeaveResponse {}))
     }
@@ -157,7 +167,9 @@ impl farm_server::Farm for FarmService {
         &self,
         request: Request<wire::FetchRequest>,
     ) -> Result<Response<Chunks>, Status> {
-        let hash = scene_hash(&request.into_inner().scene_hash).map_err(invalid)?;
+        let wire::FetchRequest { scene_hash: hash, incarnation } = request.into_inner();
+        self.shell.admit(incarnation).map_err(stranger)?;
+        let hash = scene_hash(&hash).map_err(invalid)?;
         let job = self.shell.job_with_scene(hash);
         let job = job.ok_or_else(|| Status::not_found("no job has this scene now"))?;
         let file = std::fs::File::open(job.scene.path()).map_err(|error| broken(&error))?;
@@ -173,8 +185,8 @@ fn take(
 ) -> Result<Option<oneshot::Receiver<Verdict>>, Status> {
     let lease = request.lease.ok_or_else(|| invalid(WireError::Missing("lease")))?;
     let (worker, lease) = (WorkerId(request.worker), LeaseName::from(lease));
-    let Some((tile, area)) = shell.tile(lease.job, request.tile) else { return Ok(None) };
-    let hash: PixelHash = *blake3::hash(&request.pixels).as_bytes();
+    let Some((tile, job)) = shell.tile(lease.job, request.tile) else { return Ok(None) };
+    let hash: PixelHash = job.hasher.hash(tile, &request.pixels);
     let pixels = pixels_from_bytes(&request.pixels).map_err(invalid)?;
     let tally = request.tally.ok_or_else(|| invalid(WireError::Missing("tally")))?;
     let tally = Tally::try_from(tally).map_err(invalid)?;
@@ -182,8 +194,8 @@ fn take(
         tracing::error!(worker = worker.0, tile = tile.number(), "pixels were damaged");
         return Err(Status::data_loss("the pixels do not have the hash they came with"));
     }
-    if let Err(error) = check_pixels(area, &pixels) {
-        shell.report_senseless_pixels(worker, lease.job, tile, &error.to_string());
+    if let Err(error) = check_pixels(job.grid.area(tile), &pixels) {
+        shell.report_senseless_pixels(worker, lease, tile, &error.to_string());
         return Ok(None);
     }
     let delivery = Delivery { worker, lease, tile, hash, seconds: request.seconds, tally };
@@ -223,12 +235,15 @@ impl jobs_server::Jobs for JobsService {
                 shell.submit(order).map_err(|error| Refusal::Other(error.to_string()))
             });
             let job_id = job.as_ref().ok().map(|job| job.id);
+            let identity = shell.identity;
             let unclaimed = job_id.map(|job| Unclaimed { shell, job: Some(job) });
             let outcome = match job {
                 Ok(job) => submit_response::Outcome::Accepted(wire::Accepted {
                     job: job.id.0,
                     frame: Some(job.settings.size.into()),
                     tile_count: job.grid.count(),
+                    farm: identity.farm.0.to_vec().into(),
+                    incarnation: identity.incarnation.0,
                 }),
                 Err(Refusal::Scene) => submit_response::Outcome::Refused(String::new()),
                 Err(Refusal::Other(reason)) => submit_response::Outcome::Refused(reason),
@@ -248,7 +263,8 @@ impl jobs_server::Jobs for JobsService {
         &self,
         request: Request<wire::WatchRequest>,
     ) -> Result<Response<Events>, Status> {
-        let job = self.known_job(request.into_inner().job)?;
+        let wire::WatchRequest { job, incarnation } = request.into_inner();
+        let job = self.known_job(job, incarnation)?;
         let mut progress = job.progress();
         let (send, receive) = mpsc::channel(1);
         tokio::spawn(async move {
@@ -274,7 +290,12 @@ impl jobs_server::Jobs for JobsService {
         &self,
         request: Request<wire::ImageRequest>,
     ) -> Result<Response<Chunks>, Status> {
-        let job = self.known_job(request.into_inner().job)?;
+        let wire::ImageRequest { job, incarnation } = request.into_inner();
+        // Who only knows a job's number may have its picture: no other start has that number.
+        let job = match incarnation {
+            0 => self.job(job)?,
+            _ => self.known_job(job, incarnation)?,
+        };
         if !matches!(job.progress.borrow().outcome, Some(Outcome::Finished(_))) {
             return Err(Status::failed_precondition("the job has not finished"));
         }
@@ -300,13 +321,20 @@ impl jobs_server::Jobs for JobsService {
         &self,
         request: Request<wire::CancelRequest>,
     ) -> Result<Response<wire::CancelResponse>, Status> {
-        self.shell.cancel(JobId(request.into_inner().job));
+        let wire::CancelRequest { job, incarnation } = request.into_inner();
+        self.shell.admit(incarnation).map_err(stranger)?;
+        self.shell.cancel(JobId(job));
         Ok(Response::new(wire::CancelResponse {}))
     }
 }
 
 impl JobsService {
-    fn known_job(&self, job: u64) -> Result<Arc<Job>, Status> {
+    fn known_job(&self, job: u64, incarnation: u64) -> Result<Arc<Job>, Status> {
+        self.shell.admit(incarnation).map_err(stranger)?;
+        self.job(job)
+    }
+
+    fn job(&self, job: u64) -> Result<Arc<Job>, Status> {
         let job = self.shell.job(JobId(job));
         job.ok_or_else(|| Status::not_found("there is no such job"))
     }
@@ -467,6 +495,10 @@ fn invalid(error: WireError) -> Status {
 }
 
 fn no_member(error: NoMember) -> Status {
+    Status::not_found(error.to_string())
+}
+
+fn stranger(error: Stranger) -> Status {
     Status::not_found(error.to_string())
 }
 

@@ -10,18 +10,16 @@ use std::{
     time::{Duration, Instant},
 };
 
-use rtfarm_core::{
-    prepared::SceneHash,
-    tile::{Area, TileId},
-};
+use rtfarm_core::{prepared::SceneHash, tile::TileId};
 use rtfarm_job::{FinishedTile, Order, Progress};
 use rtfarm_picture::Picture;
-use rtfarm_proto::{JobId, LeaseName, WorkerId};
+use rtfarm_proto::{Incarnation, JobId, LeaseName, TileHasher, WorkerId};
 use tokio::sync::{Notify, oneshot, watch};
 use tokio_util::sync::CancellationToken;
 
 use crate::{
     farm::{Action, Delivery, DeliveryId, Farm, Next, Notice, Verdict},
+    identity::{Identity, Stranger},
     job::Job,
     members::{NoMember, Process},
     store::SceneFile,
@@ -58,6 +56,7 @@ pub enum SubmitError {
 /// The machine and all that its answers concern.
 #[derive(Debug)]
 pub(crate) struct Shell {
+    pub(crate) identity: Identity,
     pub(crate) config: Config,
     /// Held for a moment: nothing is written and nobody is waited for under it.
     state: Mutex<State>,
@@ -104,9 +103,9 @@ enum Work {
 
 impl Shell {
     /// Makes a farm without jobs and workers.
-    pub(crate) fn new(config: Config) -> Self {
+    pub(crate) fn new(config: Config, identity: Identity) -> Self {
         let state = State {
-            farm: Farm::new(config.term),
+            farm: Farm::new(identity, config.term),
             jobs: BTreeMap::new(),
             asks: HashMap::new(),
             deliveries: HashMap::new(),
@@ -114,6 +113,7 @@ impl Shell {
             wakes_at: None,
         };
         Self {
+            identity,
             config,
             state: Mutex::new(state),
             earlier: Notify::new(),
@@ -220,6 +220,11 @@ impl Shell {
         }
     }
 
+    /// Lets a call in that is meant for this incarnation.
+    pub(crate) fn admit(&self, incarnation: u64) -> Result<(), Stranger> {
+        self.tell(|state, _| state.farm.on_call(Incarnation(incarnation)))
+    }
+
     pub(crate) fn join(&self, process: Process) -> WorkerId {
         self.tell(|state, now| state.farm.on_join(process, now))
     }
@@ -249,11 +254,11 @@ impl Shell {
         self.tell(|state, now| (state.farm.on_renew(worker, leases, now), Vec::new()))
     }
 
-    /// A tile of a job that is being rendered, and its pixels' place in the picture.
-    pub(crate) fn tile(&self, job: JobId, number: u32) -> Option<(TileId, Area)> {
+    /// A tile of a job that is being rendered, and that job.
+    pub(crate) fn tile(&self, job: JobId, number: u32) -> Option<(TileId, Arc<Job>)> {
         let state = self.state();
         let tile = state.farm.tile(job, number)?;
-        Some((tile, state.jobs.get(&job)?.grid.area(tile)))
+        Some((tile, Arc::clone(state.jobs.get(&job)?)))
     }
 
     /// Brings the pixels of a tile. The answer comes when they are safe. This writes a file: never
@@ -275,11 +280,11 @@ impl Shell {
     pub(crate) fn report_senseless_pixels(
         &self,
         worker: WorkerId,
-        job: JobId,
+        lease: LeaseName,
         tile: TileId,
         reason: &str,
     ) {
-        self.tell_farm(|farm, _| farm.on_senseless_pixels(worker, job, tile, reason));
+        self.tell_farm(|farm, now| farm.on_senseless_pixels(worker, lease, tile, reason, now));
     }
 
     pub(crate) fn leave(&self, worker: WorkerId, reason: &str) {
@@ -314,7 +319,8 @@ impl Shell {
         );
         let progress =
             watch::Sender::new(Progress { tile_count: grid.count(), ..Progress::default() });
-        let job = Arc::new(Job { id, scene, settings, grid, picture, progress });
+        let hasher = TileHasher::new(id, scene.hash(), settings, grid.side());
+        let job = Arc::new(Job { id, scene, settings, grid, hasher, picture, progress });
         // Not under the lock: there may be a million.
         let tiles = Tiles::new(grid);
         self.tell(|state, now| {
@@ -405,6 +411,26 @@ fn log(notice: Notice) {
             "two copies of a tile differ; one of their workers is broken"
         ),
         Notice::JobFailed(job, reason) => tracing::warn!(job = job.0, reason, "job failed"),
+        Notice::NotGranted { worker, lease, tile, count } => {
+            tracing::warn!(
+                worker = worker.0,
+                job = lease.job.0,
+                lease = lease.id.0,
+                tile = tile.number(),
+                count,
+                "pixels came that nobody was to render so"
+            );
+        }
+        Notice::Suspect { worker, job, tile, reason } => tracing::error!(
+            worker = worker.0,
+            job = job.0,
+            tile = tile.number(),
+            reason,
+            "a worker brought pixels that make no sense"
+        ),
+        Notice::Strangers(count) => {
+            tracing::warn!(count, "calls meant for another start of a coordinator were refused");
+        }
         Notice::JobCancelled(job) => tracing::info!(job = job.0, "job cancelled"),
     }
 }

@@ -5,7 +5,7 @@ use std::collections::BTreeSet;
 use rtfarm_core::tile::{TileGrid, TileId};
 use rtfarm_proto::LeaseId;
 
-/// The BLAKE3 hash of a tile's pixels as they travel.
+/// The hash of a tile's pixels as they travel, which covers job, scene, settings and tile too.
 pub(crate) type PixelHash = [u8; 32];
 
 /// The position of a tile in its job's order of rendering, from 0.

@@ -57,9 +57,9 @@ impl Waiting {
         self.asks.first_key_value().map(|(&id, &ask)| (id, ask))
     }
 
-    /// The oldest question of another worker than this.
-    pub(crate) fn first_but(&self, worker: WorkerId) -> Option<AskId> {
-        self.asks.iter().find(|(_, ask)| ask.worker != worker).map(|(&id, _)| id)
+    /// All questions, the oldest first.
+    pub(crate) fn iter(&self) -> impl Iterator<Item = (AskId, Ask)> {
+        self.asks.iter().map(|(&id, &ask)| (id, ask))
     }
 
     /// The question of a worker.
@@ -106,7 +106,8 @@ mod tests {
         assert_eq!(waiting.add(AskId(3), ask(1, 7)), Some(AskId(1)));
         waiting.check(|_| true);
         assert_eq!(waiting.first(), Some((AskId(2), ask(2, 5))));
-        assert_eq!(waiting.first_but(WorkerId(2)), Some(AskId(3)));
+        let ids: Vec<AskId> = waiting.iter().map(|(id, _)| id).collect();
+        assert_eq!(ids, [AskId(2), AskId(3)]);
         assert_eq!(waiting.next_deadline(), Some((start + Duration::from_secs(5), AskId(2))));
         assert_eq!(waiting.remove(AskId(2)), Some(ask(2, 5)));
         assert_eq!((waiting.of(WorkerId(1)), waiting.of(WorkerId(2))), (Some(AskId(3)), None));

@@ -3,9 +3,13 @@
 use std::time::Duration;
 
 use rtfarm_coordinator::{Config, Coordinator, Listener};
-use rtfarm_core::render::{Quality, Sampling};
+use rtfarm_core::{
+    prepared::SceneHash,
+    render::{Quality, Sampling, Settings},
+    tile::{Size, TileGrid},
+};
 use rtfarm_proto::{
-    Address, LeaseName, PROTOCOL, pixels_to_bytes,
+    Address, JobId, LeaseName, PROTOCOL, TileHasher, pixels_to_bytes, scene_hash,
     wire::{
         self, event::End, farm_client::FarmClient, jobs_client::JobsClient, lease_response::Next,
         submit_request::Part, submit_response::Outcome,
@@ -27,7 +31,10 @@ struct Farm {
     tiles: FarmClient<Channel>,
     jobs: JobsClient<Channel>,
     worker: u32,
+    incarnation: u64,
     job: u64,
+    scene: SceneHash,
+    settings: Settings,
 }
 
 impl Farm {
@@ -42,25 +49,47 @@ impl Farm {
             upload_silence: Duration::from_millis(600),
             scene_folder: folder.path().to_owned(),
             picture_folder: folder.path().to_owned(),
-        });
+        })
+        .unwrap();
         tokio::spawn(async move {
             coordinator.run(Listener::Tcp(listener), std::future::pending()).await
         });
         let channel = address.connect().await.unwrap();
         let (mut tiles, mut jobs) = (FarmClient::new(channel.clone()), JobsClient::new(channel));
-        let worker = tiles.join(join(VERSION)).await.unwrap().into_inner().worker;
+        let joined = tiles.join(join(VERSION)).await.unwrap().into_inner();
+        let wire::JoinResponse { worker, incarnation, .. } = joined;
         let parts = [Part::Order(order(VERSION)), Part::Text(SCENE.into())]
             .map(|part| wire::SubmitRequest { part: Some(part) });
         let answer = jobs.submit(tokio_stream::iter(parts)).await.unwrap().into_inner();
         let Some(Outcome::Accepted(accepted)) = answer.outcome else { panic!("{answer:?}") };
-        assert_eq!(accepted.tile_count, 2);
-        Self { _folder: folder, tiles, jobs, worker, job: accepted.job }
+        assert_eq!((accepted.tile_count, accepted.incarnation), (2, incarnation));
+        assert_eq!(accepted.farm, joined.farm);
+        Self {
+            _folder: folder,
+            tiles,
+            jobs,
+            worker,
+            incarnation,
+            job: accepted.job,
+            scene: SceneHash([0; 32]),
+            settings: Settings { size: Size::new(16, 8).unwrap(), quality: Quality::default() },
+        }
     }
 
     async fn lease(&mut self) -> (LeaseName, Vec<u32>) {
-        let request = wire::LeaseRequest { worker: self.worker, max_tiles: 64, wait_ms: 5000 };
+        let request = wire::LeaseRequest {
+            worker: self.worker,
+            max_tiles: 64,
+            wait_ms: 5000,
+            incarnation: self.incarnation,
+        };
         match self.tiles.lease(request).await.unwrap().into_inner().next {
-            Some(Next::Run(run)) => (run.lease.unwrap().into(), run.tiles),
+            Some(Next::Run(run)) => {
+                let job = run.job.unwrap();
+                self.scene = scene_hash(&job.scene_hash).unwrap();
+                self.settings = job.settings.unwrap().try_into().unwrap();
+                (run.lease.unwrap().into(), run.tiles)
+            }
             other => panic!("no tiles but {other:?}"),
         }
     }
@@ -72,8 +101,16 @@ impl Farm {
         value: f32,
     ) -> Result<wire::Verdict, Code> {
         let pixels = pixels_to_bytes(&[[value; 3]; 64]);
-        let hash = blake3::hash(&pixels).as_bytes().to_vec();
+        let hash = self.hash(tile, &pixels);
         self.send(lease, tile, pixels.to_vec(), hash).await
+    }
+
+    /// The hash that a worker gives such a tile; that of tile 0 when there is none of this number.
+    fn hash(&self, tile: u32, pixels: &[u8]) -> Vec<u8> {
+        let grid = TileGrid::new(self.settings.size, 8).unwrap();
+        let tile = grid.tile(tile).or(grid.tile(0)).unwrap();
+        let hasher = TileHasher::new(JobId(self.job), self.scene, self.settings, 8);
+        hasher.hash(tile, pixels).to_vec()
     }
 
     async fn send(
@@ -85,6 +122,7 @@ impl Farm {
     ) -> Result<wire::Verdict, Code> {
         let delivery = wire::DeliverRequest {
             worker: self.worker,
+            incarnation: self.incarnation,
             lease: Some(lease.into()),
             tile,
             pixels: pixels.into(),
@@ -98,7 +136,7 @@ impl Farm {
 
     /// The state of the job now.
     async fn state(&mut self) -> wire::Event {
-        let request = wire::WatchRequest { job: self.job };
+        let request = wire::WatchRequest { job: self.job, incarnation: self.incarnation };
         let mut events = self.jobs.watch(request).await.unwrap().into_inner();
         events.message().await.unwrap().unwrap()
     }
@@ -153,7 +191,11 @@ async fn a_lease_without_progress_is_given_again_and_late_pixels_count() {
             break (lease, more);
         }
     };
-    let renewal = wire::RenewRequest { worker: farm.worker, leases: vec![late.into()] };
+    let renewal = wire::RenewRequest {
+        worker: farm.worker,
+        leases: vec![late.into()],
+        incarnation: farm.incarnation,
+    };
     let lost = farm.tiles.renew(renewal).await.unwrap().into_inner().lost;
     assert_eq!(lost, [late.into()]);
     assert_eq!(farm.deliver(late, tiles[0], 0.5).await, Ok(wire::Verdict::Accepted));
@@ -165,15 +207,22 @@ async fn damaged_and_senseless_pixels_are_refused() {
     let mut farm = Farm::new().await;
     let (lease, tiles) = farm.lease().await;
     let bytes = vec![0; 64 * 12];
-    let hash = blake3::hash(&bytes).as_bytes().to_vec();
-    assert_eq!(farm.send(lease, tiles[0], bytes, vec![0; 32]).await, Err(Code::DataLoss));
+    let hash = farm.hash(tiles[0], &bytes);
+    assert_eq!(farm.send(lease, tiles[0], bytes.clone(), vec![0; 32]).await, Err(Code::DataLoss));
     let short = vec![0; 13];
-    let short_hash = blake3::hash(&short).as_bytes().to_vec();
+    let short_hash = farm.hash(tiles[0], &short);
     assert_eq!(farm.send(lease, tiles[0], short, short_hash).await, Err(Code::InvalidArgument));
+    let other_tile = farm.hash(1 - tiles[0], &bytes);
+    assert_eq!(farm.send(lease, tiles[0], bytes.clone(), other_tile).await, Err(Code::DataLoss));
+    let plain = blake3::hash(&bytes).as_bytes().to_vec();
+    assert_eq!(farm.send(lease, tiles[0], bytes.clone(), plain).await, Err(Code::DataLoss));
     let rejected = Ok(wire::Verdict::Rejected);
     assert_eq!(farm.send(lease, 99, vec![0; 64 * 12], hash).await, rejected);
     assert_eq!(farm.state().await.tiles_done, 0);
 
+    assert_eq!(farm.deliver(lease, tiles[0], f32::NAN).await, rejected);
+    assert!(farm.state().await.end.is_none(), "the worker is to blame");
+    let (lease, tiles) = farm.lease().await;
     assert_eq!(farm.deliver(lease, tiles[0], f32::NAN).await, rejected);
     let Some(End::Failed(reason)) = farm.state().await.end else { panic!("it goes on") };
     assert!(reason.contains("is not a number"), "{reason}");
@@ -185,13 +234,14 @@ async fn strangers_are_told_what_is_wrong() {
     let status = farm.tiles.join(join("1.2.4")).await.unwrap_err();
     assert_eq!(status.code(), Code::FailedPrecondition);
     assert!(status.message().contains("rtfarm 1.2.4") && status.message().contains(VERSION));
-    let request = wire::LeaseRequest { worker: 77, max_tiles: 1, wait_ms: 0 };
+    let incarnation = farm.incarnation;
+    let request = wire::LeaseRequest { worker: 77, max_tiles: 1, wait_ms: 0, incarnation };
     assert_eq!(farm.tiles.lease(request).await.unwrap_err().code(), Code::NotFound);
-    let request = wire::FetchRequest { scene_hash: vec![1; 32].into() };
+    let request = wire::FetchRequest { scene_hash: vec![1; 32].into(), incarnation };
     assert_eq!(farm.tiles.fetch(request).await.unwrap_err().code(), Code::NotFound);
-    let request = wire::WatchRequest { job: 77 };
+    let request = wire::WatchRequest { job: 77, incarnation };
     assert_eq!(farm.jobs.watch(request).await.unwrap_err().code(), Code::NotFound);
-    let request = wire::ImageRequest { job: farm.job };
+    let request = wire::ImageRequest { job: farm.job, incarnation };
     assert_eq!(farm.jobs.image(request).await.unwrap_err().code(), Code::FailedPrecondition);
 }
 
@@ -236,7 +286,12 @@ async fn a_client_that_goes_while_its_scene_is_prepared_leaves_no_job() {
     tokio::time::sleep(Duration::from_millis(30)).await;
     assert!(!submitting.is_finished(), "the scene is being prepared");
     submitting.abort();
-    let request = wire::LeaseRequest { worker: farm.worker, max_tiles: 64, wait_ms: 5000 };
+    let request = wire::LeaseRequest {
+        worker: farm.worker,
+        incarnation: farm.incarnation,
+        max_tiles: 64,
+        wait_ms: 5000,
+    };
     let next = farm.tiles.lease(request).await.unwrap().into_inner().next;
     assert!(matches!(next, Some(Next::Nothing(_))), "{next:?}");
 }
@@ -268,4 +323,40 @@ async fn an_upload_that_stands_still_is_dropped() {
     let dropped = begin_to_submit(&farm, VERSION).await;
     let dropped = tokio::time::timeout(Duration::from_secs(10), dropped).await;
     assert_eq!(dropped.expect("it is dropped").unwrap(), Code::DeadlineExceeded);
+}
+
+#[tokio::test]
+async fn calls_meant_for_another_start_of_the_coordinator_are_refused() {
+    let mut farm = Farm::new().await;
+    let (lease, tiles) = farm.lease().await;
+    let (worker, job, incarnation) = (farm.worker, farm.job, farm.incarnation ^ 1);
+    let request = wire::LeaseRequest { worker, incarnation, max_tiles: 1, wait_ms: 0 };
+    let status = farm.tiles.lease(request).await.unwrap_err();
+    assert_eq!(status.code(), Code::NotFound);
+    assert!(status.message().contains("not meant for this start"), "{status}");
+    let leases = vec![lease.into()];
+    let request = wire::RenewRequest { worker, incarnation, leases };
+    assert_eq!(farm.tiles.renew(request).await.unwrap_err().code(), Code::NotFound);
+    let request = wire::LeaveRequest { worker, incarnation, reason: String::new() };
+    assert_eq!(farm.tiles.leave(request).await.unwrap_err().code(), Code::NotFound);
+    let request = wire::WatchRequest { job, incarnation };
+    assert_eq!(farm.jobs.watch(request).await.unwrap_err().code(), Code::NotFound);
+    let request = wire::CancelRequest { job, incarnation };
+    assert_eq!(farm.jobs.cancel(request).await.unwrap_err().code(), Code::NotFound);
+    farm.incarnation ^= 1;
+    assert_eq!(farm.deliver(lease, tiles[0], 0.5).await, Err(Code::NotFound));
+    farm.incarnation ^= 1;
+    assert_eq!(farm.state().await.tiles_done, 0);
+    assert_eq!(farm.deliver(lease, tiles[0], 0.5).await, Ok(wire::Verdict::Accepted));
+}
+
+#[tokio::test]
+async fn who_never_joined_brings_no_pixels() {
+    let mut farm = Farm::new().await;
+    let (lease, tiles) = farm.lease().await;
+    let member = std::mem::replace(&mut farm.worker, 77);
+    assert_eq!(farm.deliver(lease, tiles[0], 0.5).await, Ok(wire::Verdict::Rejected));
+    assert_eq!(farm.state().await.tiles_done, 0);
+    farm.worker = member;
+    assert_eq!(farm.deliver(lease, tiles[0], 0.5).await, Ok(wire::Verdict::Accepted));
 }

@@ -5,11 +5,13 @@
 mod address;
 mod convert;
 mod name;
+mod tile_hash;
 
 pub use address::{Address, AddressError};
 pub use convert::{WireError, pixels_from_bytes, pixels_to_bytes, scene_hash, transfer};
-pub use name::{JobId, LeaseId, LeaseName, WorkerId};
+pub use name::{FarmId, Incarnation, JobId, LeaseId, LeaseName, WorkerId};
 pub use prost::bytes::Bytes;
+pub use tile_hash::TileHasher;
 
 /// The messages, clients and servers that `proto/generate` writes from `farm.proto`.
 #[expect(
@@ -23,7 +25,7 @@ pub mod wire {
 }
 
 /// The version of `farm.proto`. Both sides must have the same, and the same package version.
-pub const PROTOCOL: u32 = 3;
+pub const PROTOCOL: u32 = 4;
 
 /// The largest message that either side takes: a tile of the largest side, 12 bytes a pixel, and
 /// room for what stands around it.

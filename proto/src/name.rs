@@ -1,18 +1,28 @@
-//! The numbers of workers, jobs and leases.
+//! The numbers of farms, workers, jobs and leases.
 
 use std::fmt;
 
 use crate::wire;
 
-/// A member of the farm, from joining to leaving. Numbers are never given twice.
+/// A farm: random, so that no two have the same.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct FarmId(pub [u8; 16]);
+
+/// One start of a farm's coordinator: random, so that calls meant for an earlier start are known.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Incarnation(pub u64);
+
+/// A member of the farm, from joining to leaving. An incarnation never gives a number
+/// twice.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub struct WorkerId(pub u32);
 
-/// A job: a picture that somebody ordered. Numbers are never given twice.
+/// A job: a picture that somebody ordered. Numbers are never given twice, whichever coordinator
+/// gives them.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub struct JobId(pub u64);
 
-/// A lease, numbered over all jobs of a coordinator. Numbers are never given twice.
+/// A lease, numbered over all jobs of an incarnation, which never gives a number twice.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub struct LeaseId(pub u64);
 
@@ -23,6 +33,12 @@ pub struct LeaseName {
     pub job: JobId,
     /// The lease.
     pub id: LeaseId,
+}
+
+impl fmt::Display for FarmId {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{:032x}", u128::from_be_bytes(self.0))
+    }
 }
 
 impl fmt::Display for WorkerId {

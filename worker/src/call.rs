@@ -3,9 +3,16 @@
 use std::{sync::Arc, time::Duration};
 
 use rtfarm_core::{render::Tally, tile::TileId};
-use rtfarm_proto::{Bytes, LONGEST_WAIT, LeaseName, WorkerId};
+use rtfarm_proto::{Bytes, FarmId, Incarnation, LONGEST_WAIT, LeaseName, WorkerId};
 
 use crate::job::Job;
+
+/// Who a worker is, and on which start of the coordinator.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct Membership {
+    pub(crate) worker: WorkerId,
+    pub(crate) incarnation: Incarnation,
+}
 
 /// A question to the coordinator. Each may be repeated safely.
 #[derive(Debug, Clone, PartialEq)]
@@ -15,13 +22,13 @@ pub(crate) enum Call {
     /// Makes this process a member.
     Join,
     /// Asks for tiles; the answer may take as long as `wait`.
-    Lease { worker: WorkerId, most_tiles: usize, wait: Duration },
+    Lease { member: Membership, most_tiles: usize, wait: Duration },
     /// Proves progress under these leases.
-    Renew { worker: WorkerId, leases: Vec<LeaseName> },
+    Renew { member: Membership, leases: Vec<LeaseName> },
     /// Brings a tile.
-    Deliver { worker: WorkerId, tile: Delivery },
+    Deliver { member: Membership, tile: Delivery },
     /// Gives every lease back.
-    Leave { worker: WorkerId, reason: String },
+    Leave { member: Membership, reason: String },
 }
 
 /// What the coordinator answers to a [`Call`].
@@ -30,7 +37,7 @@ pub(crate) enum Answer {
     /// To [`Call::Connect`].
     Connected,
     /// To [`Call::Join`]: who the worker is now, and how long a lease lives without progress.
-    Joined { worker: WorkerId, term: Duration },
+    Joined { member: Membership, farm: FarmId, term: Duration },
     /// To [`Call::Lease`].
     Leased(Next),
     /// To [`Call::Renew`]: the leases among those that this worker has lost.
@@ -64,7 +71,7 @@ pub(crate) struct Delivery {
     pub(crate) tile: TileId,
     /// Red, green and blue as little-endian f32, row by row.
     pub(crate) pixels: Bytes,
-    /// The BLAKE3 hash of `pixels`.
+    /// What the job's `TileHasher` makes of them.
     pub(crate) hash: [u8; 32],
     pub(crate) tally: Tally,
     /// What the tile took one thread.

@@ -4,13 +4,13 @@
 use std::{error::Error, sync::Arc, time::Duration};
 
 use rtfarm_proto::{
-    Address, MESSAGE_BYTES, PROTOCOL, WireError, WorkerId,
+    Address, FarmId, Incarnation, LeaseName, MESSAGE_BYTES, PROTOCOL, WireError, WorkerId,
     wire::{self, farm_client::FarmClient, lease_response},
 };
 use tonic::{Code, Status, transport::Channel};
 
 use crate::{
-    call::{Answer, Call, CallError, CallErrorKind, Delivery, Next, Run},
+    call::{Answer, Call, CallError, CallErrorKind, Delivery, Membership, Next, Run},
     config::Config,
     job::{Job, JobError},
 };
@@ -54,38 +54,52 @@ pub(crate) async fn ask(
         Call::Join => {
             let joined = client.join(wire::JoinRequest::clone(&introduction)).await?.into_inner();
             let term = Duration::from_millis(joined.term_ms.into());
-            Ok(Answer::Joined { worker: WorkerId(joined.worker), term })
+            let member = Membership {
+                worker: WorkerId(joined.worker),
+                incarnation: Incarnation(joined.incarnation),
+            };
+            let farm = joined.farm.as_ref().try_into().map(FarmId);
+            let farm = farm.map_err(|_| JobError::from(WireError::Missing("farm")))?;
+            Ok(Answer::Joined { member, farm, term })
         }
-        Call::Lease { worker, most_tiles, wait } => {
+        Call::Lease { member, most_tiles, wait } => {
             let request = wire::LeaseRequest {
-                worker: worker.0,
+                worker: member.worker.0,
+                incarnation: member.incarnation.0,
                 max_tiles: u32::try_from(most_tiles).unwrap_or(u32::MAX),
                 wait_ms: u32::try_from(wait.as_millis()).unwrap_or(u32::MAX),
             };
-            Ok(Answer::Leased(read_next(client.lease(request).await?.into_inner())?))
+            let answer = client.lease(request).await?.into_inner();
+            Ok(Answer::Leased(read_next(answer, member.incarnation)?))
         }
-        Call::Renew { worker, leases } => {
-            let leases = leases.into_iter().map(Into::into).collect();
-            let renewed = client.renew(wire::RenewRequest { worker: worker.0, leases }).await?;
+        Call::Renew { member, leases } => {
+            let request = wire::RenewRequest {
+                worker: member.worker.0,
+                incarnation: member.incarnation.0,
+                leases: leases.into_iter().map(Into::into).collect(),
+            };
+            let renewed = client.renew(request).await?;
             let lost = renewed.into_inner().lost.into_iter().map(Into::into).collect();
             Ok(Answer::Renewed { lost })
         }
-        Call::Deliver { worker, tile } => {
+        Call::Deliver { member, tile } => {
             let number = tile.tile.number();
-            let delivered = client.deliver(write_delivery(worker, tile)).await?.into_inner();
+            let delivered = client.deliver(write_delivery(member, tile)).await?.into_inner();
             tracing::debug!(tile = number, verdict = ?delivered.verdict(), "delivered");
             Ok(Answer::Delivered)
         }
-        Call::Leave { worker, reason } => {
-            client.leave(wire::LeaveRequest { worker: worker.0, reason }).await?;
+        Call::Leave { member, reason } => {
+            let (worker, incarnation) = (member.worker.0, member.incarnation.0);
+            client.leave(wire::LeaveRequest { worker, reason, incarnation }).await?;
             Ok(Answer::Left)
         }
     }
 }
 
-fn write_delivery(worker: WorkerId, delivery: Delivery) -> wire::DeliverRequest {
+fn write_delivery(member: Membership, delivery: Delivery) -> wire::DeliverRequest {
     wire::DeliverRequest {
-        worker: worker.0,
+        worker: member.worker.0,
+        incarnation: member.incarnation.0,
         lease: Some(delivery.lease.into()),
         tile: delivery.tile.number(),
         pixels: delivery.pixels,
@@ -95,17 +109,17 @@ fn write_delivery(worker: WorkerId, delivery: Delivery) -> wire::DeliverRequest 
     }
 }
 
-fn read_next(answer: wire::LeaseResponse) -> Result<Next, JobError> {
+fn read_next(answer: wire::LeaseResponse, incarnation: Incarnation) -> Result<Next, JobError> {
     match answer.next {
-        Some(lease_response::Next::Run(run)) => read_run(run).map(Next::Run),
+        Some(lease_response::Next::Run(run)) => read_run(run, incarnation).map(Next::Run),
         Some(lease_response::Next::ShutDown(_)) => Ok(Next::ShutDown),
         Some(lease_response::Next::Nothing(_)) | None => Ok(Next::Nothing),
     }
 }
 
-fn read_run(run: wire::Run) -> Result<Run, JobError> {
-    let lease = run.lease.ok_or(WireError::Missing("lease"))?.into();
-    let job = Job::try_from(run.job.ok_or(WireError::Missing("job"))?)?;
+fn read_run(run: wire::Run, incarnation: Incarnation) -> Result<Run, JobError> {
+    let lease = LeaseName::from(run.lease.ok_or(WireError::Missing("lease"))?);
+    let job = Job::new(lease.job, &run.job.ok_or(WireError::Missing("job"))?, incarnation)?;
     let tile = |&number| job.grid.tile(number).ok_or(WireError::Missing("tile"));
     let tiles = run.tiles.iter().map(tile).collect::<Result<_, _>>()?;
     Ok(Run { lease, tiles, job: Arc::new(job) })

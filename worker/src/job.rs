@@ -7,17 +7,21 @@ use rtfarm_core::{
     render::Settings,
     tile::{TileGrid, TileSideError},
 };
-use rtfarm_proto::{WireError, scene_hash, wire};
+use rtfarm_proto::{Incarnation, JobId, TileHasher, WireError, scene_hash, wire};
 
 /// What a worker needs to know to render tiles of a job.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Job {
+    /// The start of the coordinator that has this job.
+    pub(crate) incarnation: Incarnation,
     pub(crate) scene: SceneHash,
     pub(crate) scene_byte_count: u64,
     /// Where the scene is on this machine; `None` when it has to be fetched.
     pub(crate) scene_path: Option<Arc<Path>>,
     pub(crate) settings: Settings,
     pub(crate) grid: TileGrid,
+    /// Hashes its pixels.
+    pub(crate) hasher: TileHasher,
 }
 
 /// Why a message describes no job.
@@ -29,17 +33,23 @@ pub(crate) enum JobError {
     TileSide(#[from] TileSideError),
 }
 
-impl TryFrom<wire::Job> for Job {
-    type Error = JobError;
-
-    fn try_from(job: wire::Job) -> Result<Self, JobError> {
+impl Job {
+    /// Reads what a coordinator says of a job.
+    pub(crate) fn new(
+        id: JobId,
+        job: &wire::Job,
+        incarnation: Incarnation,
+    ) -> Result<Self, JobError> {
         let settings: Settings = job.settings.ok_or(WireError::Missing("settings"))?.try_into()?;
+        let scene = scene_hash(&job.scene_hash)?;
         Ok(Self {
-            scene: scene_hash(&job.scene_hash)?,
+            incarnation,
+            scene,
             scene_byte_count: job.scene_bytes,
             scene_path: (!job.scene_path.is_empty()).then(|| Path::new(&job.scene_path).into()),
             settings,
             grid: TileGrid::new(settings.size, job.tile_side.into())?,
+            hasher: TileHasher::new(id, scene, settings, job.tile_side),
         })
     }
 }

@@ -257,7 +257,7 @@ impl Shell {
             };
             let delivery = rendered.map(|rendered| {
                 let pixels = pixels_to_bytes(&rendered.pixels);
-                let hash = *blake3::hash(&pixels).as_bytes();
+                let hash = job.hasher.hash(tile, &pixels);
                 let seconds = started.elapsed().as_secs_f64();
                 Delivery { lease, tile, pixels, hash, tally: rendered.tally, seconds }
             });

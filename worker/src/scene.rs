@@ -96,7 +96,10 @@ async fn fetch(
 ) -> Result<File, SceneError> {
     // The file has no name, so that nothing stays behind.
     let mut file = tempfile::tempfile()?;
-    let request = wire::FetchRequest { scene_hash: job.scene.0.to_vec().into() };
+    let request = wire::FetchRequest {
+        scene_hash: job.scene.0.to_vec().into(),
+        incarnation: job.incarnation.0,
+    };
     let late = |_| SceneError::Gone("the coordinator was silent for too long".to_owned());
     let fetched = tokio::time::timeout(silence, client.fetch(request));
     let mut chunks = fetched.await.map_err(late)??.into_inner();
@@ -130,7 +133,7 @@ mod tests {
         render::{Quality, Settings},
         tile::{Size, TileGrid},
     };
-    use rtfarm_proto::Address;
+    use rtfarm_proto::{Address, Incarnation, JobId, TileHasher};
     use rustix::fs::{CWD, FileType, Mode, mknodat};
     use tonic::transport::Endpoint;
 
@@ -139,12 +142,15 @@ mod tests {
     /// What comes of a job whose scene is said to be at `path`, with a coordinator that is gone.
     async fn load_from(path: &Path, is_local: bool) -> Result<Arc<Scene>, SceneError> {
         let size = Size::new(16, 16).unwrap();
+        let settings = Settings { size, quality: Quality::default() };
         let job = Job {
+            incarnation: Incarnation(1),
             scene: SceneHash([0; 32]),
             scene_byte_count: 1,
             scene_path: Some(path.into()),
-            settings: Settings { size, quality: Quality::default() },
+            settings,
             grid: TileGrid::new(size, 16).unwrap(),
+            hasher: TileHasher::new(JobId(1), SceneHash([0; 32]), settings, 16),
         };
         let nowhere = Address::Tcp("127.0.0.1:1".to_owned()).to_string();
         let client = FarmClient::new(Endpoint::from_shared(nowhere).unwrap().connect_lazy());

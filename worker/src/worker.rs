@@ -10,10 +10,10 @@ use std::{
 };
 
 use rtfarm_core::{prepared::SceneHash, tile::TileId};
-use rtfarm_proto::{Address, LONGEST_WAIT, LeaseName, WorkerId};
+use rtfarm_proto::{Address, LONGEST_WAIT, LeaseName};
 
 use crate::{
-    call::{Answer, Call, CallError, CallErrorKind, Delivery, Next, Run},
+    call::{Answer, Call, CallError, CallErrorKind, Delivery, Membership, Next, Run},
     config::Config,
     error::WorkerError,
     job::Job,
@@ -66,7 +66,7 @@ enum Stage {
 /// A worker that has joined.
 #[derive(Debug)]
 struct Member {
-    id: WorkerId,
+    id: Membership,
     threads: usize,
     /// The leases that this worker knows to have, and the tiles of each that are not on their way
     /// to the coordinator yet: at least one.
@@ -128,10 +128,11 @@ impl Worker {
         }
         match (&mut self.stage, answer) {
             (Stage::Joining, Answer::Connected) => self.tasks.call(Call::Join, now),
-            (Stage::Joining, Answer::Joined { worker, term }) => {
-                tracing::info!(worker = worker.0, coordinator = %self.coordinator, "joined");
+            (Stage::Joining, Answer::Joined { member, farm, term }) => {
+                let (worker, coordinator) = (member.worker.0, &self.coordinator);
+                tracing::info!(worker, %coordinator, %farm, "joined");
                 self.tasks.push(Action::HearBeats { period: term / BEATS_A_TERM });
-                self.stage = Stage::Working(Member::new(worker, self.threads));
+                self.stage = Stage::Working(Member::new(member, self.threads));
             }
             (Stage::Working(member), Answer::Leased(next)) => {
                 member.is_leasing = false;
@@ -139,7 +140,7 @@ impl Worker {
                     Next::Run(run) => member.on_run(run, &mut self.tasks),
                     Next::Nothing => {}
                     Next::ShutDown => {
-                        tracing::info!(worker = member.id.0, "sent home");
+                        tracing::info!(worker = member.id.worker.0, "sent home");
                         self.end(Ok(()));
                     }
                 }
@@ -179,7 +180,7 @@ impl Worker {
         }
         match (&mut self.stage, error) {
             (Stage::Working(member), SceneError::Gone(reason)) => {
-                tracing::info!(worker = member.id.0, reason, "dropped a lease");
+                tracing::info!(worker = member.id.worker.0, reason, "dropped a lease");
                 if let Some(run) = member.fetching.take() {
                     member.leases.remove(&run.lease);
                 }
@@ -252,7 +253,8 @@ impl Worker {
         }
     }
 
-    /// The coordinator does not know this worker any more, nor its leases.
+    /// The coordinator does not know this worker any more, nor its leases: it may have been started
+    /// anew. What was rendered for those leases is of no use.
     fn join_again(&mut self, reason: &str, now: Instant) {
         tracing::warn!(reason, "joining again");
         self.tasks.stop_all();
@@ -274,7 +276,7 @@ impl Worker {
             Ok(()) => "the worker was stopped".to_owned(),
             Err(error) => error.to_string(),
         };
-        let leave = Call::Leave { worker: member.id, reason };
+        let leave = Call::Leave { member: member.id, reason };
         self.tasks.stop_all();
         self.tasks.call(leave, now);
         self.drain_until = None;
@@ -306,7 +308,7 @@ impl Worker {
 }
 
 impl Member {
-    fn new(id: WorkerId, threads: usize) -> Self {
+    fn new(id: Membership, threads: usize) -> Self {
         Self {
             id,
             threads,
@@ -355,7 +357,7 @@ impl Member {
     fn on_leases_lost(&mut self, lost: &[LeaseName], tasks: &mut Tasks) {
         for &name in lost {
             if self.leases.remove(&name).is_some() {
-                tracing::info!(worker = self.id.0, ?name, "lost a lease");
+                tracing::info!(worker = self.id.worker.0, ?name, "lost a lease");
                 self.waiting.retain(|waiting| waiting.lease != name);
                 tasks.stop_renderings(name);
             }
@@ -369,7 +371,7 @@ impl Member {
         {
             self.on_tile_sent(tile.lease);
             self.delivering_count += 1;
-            tasks.call(Call::Deliver { worker: self.id, tile }, now);
+            tasks.call(Call::Deliver { member: self.id, tile }, now);
         }
         if is_draining {
             self.waiting.clear();
@@ -387,13 +389,13 @@ impl Member {
         if is_short && !is_draining && !self.is_leasing && self.fetching.is_none() {
             self.is_leasing = true;
             let most_tiles = LONGEST_RUN_A_THREAD * self.threads;
-            tasks.call(Call::Lease { worker: self.id, most_tiles, wait: LONGEST_WAIT }, now);
+            tasks.call(Call::Lease { member: self.id, most_tiles, wait: LONGEST_WAIT }, now);
         }
         if self.has_beaten && !self.is_renewing && !self.leases.is_empty() {
             self.has_beaten = false;
             self.is_renewing = true;
             let leases = self.leases.keys().copied().collect();
-            tasks.call(Call::Renew { worker: self.id, leases }, now);
+            tasks.call(Call::Renew { member: self.id, leases }, now);
         }
     }
 

@@ -6,7 +6,7 @@ use rtfarm_core::{
     render::{Quality, Settings, Tally},
     tile::{Size, TileGrid},
 };
-use rtfarm_proto::wire;
+use rtfarm_proto::{FarmId, Incarnation, JobId, TileHasher, WorkerId, wire};
 
 use super::*;
 
@@ -22,17 +22,25 @@ fn lease(number: u64) -> LeaseName {
     wire::LeaseName { job: 1, id: number }.into()
 }
 
+/// A worker's membership of an incarnation that has the same number.
+fn member(number: u32) -> Membership {
+    Membership { worker: WorkerId(number), incarnation: Incarnation(number.into()) }
+}
+
 fn grid() -> TileGrid {
     TileGrid::new(Size::new(160, 160).unwrap(), 16).unwrap()
 }
 
 fn job(scene: u8) -> Arc<Job> {
+    let settings = Settings { size: Size::new(160, 160).unwrap(), quality: Quality::default() };
     Arc::new(Job {
+        incarnation: Incarnation(1),
         scene: SceneHash([scene; 32]),
         scene_byte_count: 1,
         scene_path: None,
-        settings: Settings { size: Size::new(160, 160).unwrap(), quality: Quality::default() },
+        settings,
         grid: grid(),
+        hasher: TileHasher::new(JobId(1), SceneHash([scene; 32]), settings, 16),
     })
 }
 
@@ -130,7 +138,7 @@ impl Bench {
     }
 
     fn join(&mut self, worker: u32) {
-        let joined = Answer::Joined { worker: WorkerId(worker), term: TERM };
+        let joined = Answer::Joined { member: member(worker), farm: FarmId([7; 16]), term: TERM };
         self.answer(|call| matches!(call, Call::Join), joined);
     }
 
@@ -243,14 +251,14 @@ fn a_tile_goes_from_its_lease_to_its_delivery() {
     let mut bench = Bench::joined(1);
     assert_eq!(bench.beat_period, Some(TERM / 4));
     let asked = bench.answer(is_lease, run(1, 1, 0));
-    let (worker, wait) = (WorkerId(1), LONGEST_WAIT);
-    assert_eq!(asked, Call::Lease { worker, most_tiles: LONGEST_RUN_A_THREAD, wait });
+    let (member, wait) = (member(1), LONGEST_WAIT);
+    assert_eq!(asked, Call::Lease { member, most_tiles: LONGEST_RUN_A_THREAD, wait });
     assert!(bench.calls.is_empty(), "nothing is asked for while a scene is fetched");
     bench.fetch();
     assert!(bench.has(is_lease), "one tile is too few to go on with");
     let (name, tile) = bench.render();
     let delivered = bench.answer(is_deliver, Answer::Delivered);
-    assert_eq!(delivered, Call::Deliver { worker, tile: delivery(name, tile) });
+    assert_eq!(delivered, Call::Deliver { member, tile: delivery(name, tile) });
     assert!(!bench.has(is_deliver));
 }
 
@@ -295,7 +303,7 @@ fn slow_deliveries_stop_the_threads_and_the_asking() {
 fn pixels_are_kept_until_they_are_acknowledged() {
     let mut bench = Bench::rendering(1, 1);
     let (name, tile) = bench.render();
-    let expected = Call::Deliver { worker: WorkerId(1), tile: delivery(name, tile) };
+    let expected = Call::Deliver { member: member(1), tile: delivery(name, tile) };
     for _ in 0..5 {
         assert_eq!(bench.fail(is_deliver, no_answer()), expected);
         assert!(!bench.has(is_deliver), "not at once");
@@ -316,7 +324,7 @@ fn progress_renews_every_lease_one_renewal_at_a_time() {
     bench.beat();
     let first = bench.answer(is_renew, Answer::Renewed { lost: vec![] });
     let leases = vec![lease(1), lease(2)];
-    assert_eq!(first, Call::Renew { worker: WorkerId(1), leases });
+    assert_eq!(first, Call::Renew { member: member(1), leases });
     bench.answer(is_renew, Answer::Renewed { lost: vec![] });
     assert!(!bench.has(is_renew), "nothing new to tell");
 }
@@ -342,7 +350,7 @@ fn a_lost_lease_is_rendered_no_further_but_its_pixels_are_delivered() {
         bench.render();
     }
     let delivered = bench.answer(is_deliver, Answer::Delivered);
-    assert_eq!(delivered, Call::Deliver { worker: WorkerId(1), tile: delivery(name, tile) });
+    assert_eq!(delivered, Call::Deliver { member: member(1), tile: delivery(name, tile) });
     assert!(!bench.has(is_deliver) && bench.has(is_lease));
 }
 
@@ -402,7 +410,7 @@ fn an_unusable_scene_ends_the_worker() {
     bench.absorb();
     let reason = "the prepared scene does not have the hash that the job names".to_owned();
     let left = bench.answer(|call| matches!(call, Call::Leave { .. }), Answer::Left);
-    assert_eq!(left, Call::Leave { worker: WorkerId(1), reason: reason.clone() });
+    assert_eq!(left, Call::Leave { member: member(1), reason: reason.clone() });
     assert_eq!(bench.exit, Some(Err(reason)));
 }
 
@@ -440,10 +448,28 @@ fn a_forgotten_worker_stops_everything_and_joins_again() {
     }
     assert!(!bench.has(is_deliver), "nobody waits for what was stopped");
     let asked = bench.answer(is_lease, run(1, 1, 0));
-    assert!(matches!(asked, Call::Lease { worker: WorkerId(2), .. }));
+    assert!(matches!(asked, Call::Lease { member: as_now, .. } if as_now == member(2)));
     bench.fetch();
     bench.render();
     assert!(bench.has(is_deliver));
+}
+
+#[test]
+fn a_coordinator_started_anew_gets_no_pixel_that_was_rendered_for_the_last() {
+    let mut bench = Bench::rendering(2, 9);
+    bench.render();
+    bench.render();
+    // One delivery is repeated, one is on its way, when the coordinator says that it is another.
+    bench.fail(is_deliver, no_answer());
+    bench.fail(is_deliver, failure(CallErrorKind::NotMember));
+    bench.join(2);
+    while !bench.renderings.is_empty() {
+        bench.render();
+    }
+    for _ in 0..20 {
+        assert!(!bench.has(is_deliver) && !bench.has(is_renew));
+        bench.sleep();
+    }
 }
 
 #[test]
@@ -610,7 +636,7 @@ fn a_member_that_is_stopped_gives_its_leases_back() {
     bench.stop();
     let left = bench.answer(|_| true, Answer::Left);
     let reason = "the worker was stopped".to_owned();
-    assert_eq!(left, Call::Leave { worker: WorkerId(1), reason });
+    assert_eq!(left, Call::Leave { member: member(1), reason });
     assert_eq!(bench.exit, Some(Ok(())));
 }
 
@@ -648,8 +674,8 @@ enum Letter {
 struct Chance {
     random: SplitMix64,
     post: Vec<(Instant, Letter)>,
-    /// The worker's number now.
-    member: Option<WorkerId>,
+    /// Who the worker is now.
+    member: Option<Membership>,
     member_count: u32,
     /// Tiles of two jobs that are not leased.
     free: Vec<(u8, TileId)>,
@@ -669,8 +695,8 @@ impl Chance {
             self.member = None;
             self.take_back(|_| true);
         }
-        let is_member = |chance: &Self, worker| {
-            let is_known = chance.member == Some(worker);
+        let is_member = |chance: &Self, caller: Membership| {
+            let is_known = chance.member == Some(caller);
             if is_known { Ok(()) } else { Err(failure(CallErrorKind::NotMember)) }
         };
         match call {
@@ -678,16 +704,20 @@ impl Chance {
             Call::Join => {
                 if self.member.is_none() {
                     self.member_count += 1;
-                    self.member = Some(WorkerId(self.member_count));
+                    self.member = Some(member(self.member_count));
                 }
-                Ok(Answer::Joined { worker: self.member.unwrap(), term: TERM })
+                Ok(Answer::Joined {
+                    member: self.member.unwrap(),
+                    farm: FarmId([7; 16]),
+                    term: TERM,
+                })
             }
-            Call::Lease { worker, most_tiles, .. } => {
-                is_member(self, worker)?;
+            Call::Lease { member, most_tiles, .. } => {
+                is_member(self, member)?;
                 Ok(Answer::Leased(self.lease(most_tiles)))
             }
-            Call::Renew { worker, leases } => {
-                is_member(self, worker)?;
+            Call::Renew { member, leases } => {
+                is_member(self, member)?;
                 let gone = self.random.below(20);
                 self.take_back(|name| leases.contains(name) && name.id.0 % 20 == gone);
                 let known = &self.leases;
