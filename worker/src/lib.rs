@@ -1,7 +1,7 @@
 //! A worker of a farm: it joins a coordinator, renders the tiles that it is leased and brings
 //! the pixels. What is rendered, and by whom, the coordinator decides.
 //!
-//! [`worker`] decides what this process does next, with [`task`] for what it waits for: pure
+//! `worker` decides what this process does next, with `task` for what it waits for: pure
 //! state machines with events in, actions out and time as an argument. [`run()`] is their shell.
 
 mod call;
