@@ -8,7 +8,10 @@ use std::{
 };
 
 use rtfarm_core::prepared::{PreparedError, PreparedScene};
-use rtfarm_proto::wire::{self, farm_client::FarmClient};
+use rtfarm_proto::{
+    LeaseName,
+    wire::{self, farm_client::FarmClient},
+};
 use tonic::{Status, transport::Channel};
 
 use crate::{job::Job, map::Map, pulse::Pulse};
@@ -38,19 +41,22 @@ impl From<Status> for SceneError {
     }
 }
 
-/// Brings a job's scene into memory. Every sign of progress beats `pulse`; no piece of the scene
+/// Brings the scene of a job of which tiles are leased into memory. Every sign of progress beats
+/// `pulse`; no piece of the scene
 /// may take the coordinator longer than `silence`.
 pub(crate) async fn load(
     job: Arc<Job>,
+    lease: LeaseName,
     silence: Duration,
     client: FarmClient<Channel>,
     pulse: Arc<Pulse>,
 ) -> Result<Arc<Scene>, SceneError> {
     let file = match &job.scene_path {
         Some(path) => File::open(path)?,
-        None => fetch(&job, silence, client, &pulse).await?,
+        None => fetch(&job, silence, client, &|| pulse.beat(lease)).await?,
     };
-    let opened = tokio::task::spawn_blocking(move || open(&file, &job, &pulse)).await;
+    let opened =
+        tokio::task::spawn_blocking(move || open(&file, &job, &|| pulse.beat(lease))).await;
     opened.map_err(io::Error::other)?
 }
 
@@ -58,7 +64,7 @@ async fn fetch(
     job: &Job,
     silence: Duration,
     mut client: FarmClient<Channel>,
-    pulse: &Pulse,
+    beat: &(dyn Fn() + Sync),
 ) -> Result<File, SceneError> {
     // The file has no name, so that nothing stays behind.
     let mut file = tempfile::tempfile()?;
@@ -78,16 +84,16 @@ async fn fetch(
             return Err(SceneError::Hash);
         }
         file.write_all(&chunk.data)?;
-        pulse.beat();
+        beat();
     }
     Ok(file)
 }
 
-fn open(file: &File, job: &Job, pulse: &Pulse) -> Result<Arc<Scene>, SceneError> {
-    let scene = PreparedScene::open_in_steps(Map::new(file)?, &mut || pulse.beat())?;
+fn open(file: &File, job: &Job, beat: &dyn Fn()) -> Result<Arc<Scene>, SceneError> {
+    let scene = PreparedScene::open_in_steps(Map::new(file)?, &mut || beat())?;
     if scene.hash() != job.scene {
         return Err(SceneError::Hash);
     }
-    pulse.beat();
+    beat();
     Ok(Arc::new(scene))
 }
