@@ -23,7 +23,8 @@ pub(crate) fn message(data: &[u8]) {
         5 => check(data, check_job),
         6 => check(data, check_settings),
         7 => check::<wire::RenewRequest>(data, |message| {
-            message.leases.into_iter().for_each(check_lease);
+            let renewals = message.renewals.into_iter();
+            renewals.filter_map(|renewal| renewal.lease).for_each(check_lease);
         }),
         8 => check::<wire::RenewResponse>(data, |message| {
             message.lost.into_iter().for_each(check_lease);

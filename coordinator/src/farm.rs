@@ -9,7 +9,7 @@ use std::{
 
 use rtfarm_core::{render::Tally, tile::TileId};
 use rtfarm_job::{Outcome, Progress};
-use rtfarm_proto::{Incarnation, JobId, LONGEST_WAIT, LeaseId, LeaseName, WorkerId};
+use rtfarm_proto::{Incarnation, JobId, LONGEST_WAIT, LeaseId, LeaseName, Renewal, WorkerId};
 
 use crate::{
     identity::{Identity, Stranger},
@@ -397,16 +397,17 @@ impl Farm {
 
     // Rendering and stitching.
 
-    /// Event: a worker goes on rendering under `leases`. Answers with those that it has lost.
+    /// Event: a worker says how far it is under its leases. Answers with those that it has lost.
     pub(crate) fn on_renew(
         &mut self,
         worker: WorkerId,
-        leases: &[LeaseName],
+        renewals: &[Renewal],
         now: Instant,
     ) -> Result<Vec<LeaseName>, NoMember> {
         self.members.on_sign_of_life(worker, now)?;
-        let lost = leases.iter().filter(|&&lease| !self.leases.on_progress(worker, lease, now));
-        Ok(lost.copied().collect())
+        let lost =
+            renewals.iter().filter(|&&renewal| !self.leases.on_renewal(worker, renewal, now));
+        Ok(lost.map(|renewal| renewal.lease).collect())
     }
 
     /// Turns a number from the wire into a tile of a job that is being rendered.
@@ -1150,7 +1151,10 @@ mod tests {
         assert_eq!(verdicts(&actions), [(delivery, Verdict::Rejected)]);
         assert_eq!(forgotten(&actions), [job]);
         assert!(world.store(&run).is_empty(), "nobody wants it any more");
-        assert_eq!(world.farm.on_renew(worker, &[run.lease], world.now), Ok(vec![run.lease]));
+        assert_eq!(
+            world.farm.on_renew(worker, &[Renewal { lease: run.lease, work: 1 }], world.now),
+            Ok(vec![run.lease])
+        );
         assert!(world.farm.on_cancel(job).is_empty(), "there is no such job");
     }
 

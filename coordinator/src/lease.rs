@@ -8,7 +8,7 @@ use std::{
 };
 
 use rtfarm_core::tile::TileId;
-use rtfarm_proto::{JobId, LeaseId, LeaseName, WorkerId};
+use rtfarm_proto::{JobId, LeaseId, LeaseName, Renewal, WorkerId};
 
 use crate::tiles::{Arrival, PixelHash, Place, Tiles};
 
@@ -59,6 +59,8 @@ struct Lease {
     /// Tiles that another lease holds too.
     shared: BTreeSet<Place>,
     until: Instant,
+    /// The work that its worker has told of.
+    work: u64,
     /// When the lease began, or the last tile under it came.
     last_tile: Instant,
 }
@@ -208,20 +210,31 @@ impl Leases {
         if !alone.is_empty() {
             self.last_tiles.insert((now, id));
         }
-        self.held.insert(id, Lease { job, worker, alone, shared, until, last_tile: now });
+        self.held.insert(id, Lease { job, worker, alone, shared, until, work: 0, last_tile: now });
         run
     }
 
-    /// Event: `worker` goes on rendering under `lease`. Says whether it still has that lease.
-    pub(crate) fn on_progress(&mut self, worker: WorkerId, name: LeaseName, now: Instant) -> bool {
-        match self.held.get_mut(&name.id) {
-            Some(lease) if lease.worker == worker && lease.job == name.job => {
-                self.expiries.remove(&(lease.until, name.id));
-                lease.until = now + self.term;
-                self.expiries.insert((lease.until, name.id));
-                true
-            }
-            _ => false,
+    /// Event: `worker` says how far it is under a lease, which lives on if that is further than it
+    /// ever was. Says whether it still has that lease.
+    pub(crate) fn on_renewal(&mut self, worker: WorkerId, renewal: Renewal, now: Instant) -> bool {
+        let Renewal { lease: LeaseName { job, id }, work } = renewal;
+        let held = self.held.get_mut(&id);
+        let Some(lease) = held.filter(|lease| lease.worker == worker && lease.job == job) else {
+            return false;
+        };
+        if work > lease.work {
+            lease.work = work;
+            self.renew(id, now);
+        }
+        true
+    }
+
+    /// Has a lease run out a term from now.
+    fn renew(&mut self, id: LeaseId, now: Instant) {
+        if let Some(lease) = self.held.get_mut(&id) {
+            self.expiries.remove(&(lease.until, id));
+            lease.until = now + self.term;
+            self.expiries.insert((lease.until, id));
         }
     }
 
@@ -232,8 +245,8 @@ impl Leases {
             .is_some_and(|grant| grant.worker == worker && grant.tiles.binary_search(&tile).is_ok())
     }
 
-    /// Event: pixels of `tile` came from `worker`, which was granted it. Tiles are deterministic:
-    /// the first copy wins, however late. `None` when the job is over.
+    /// Event: pixels of `tile` came from `worker`. Tiles are deterministic: the first copy wins,
+    /// however late. `None` when the job is over or the worker was not granted the tile.
     pub(crate) fn on_pixels(
         &mut self,
         worker: WorkerId,
@@ -242,18 +255,18 @@ impl Leases {
         hash: PixelHash,
         now: Instant,
     ) -> Option<Arrival> {
-        let has_lease = self.on_progress(worker, name, now);
+        if !self.is_granted(worker, name, tile) {
+            return None;
+        }
         let tiles = self.jobs.get_mut(&name.job)?;
         let arrival = tiles.on_pixels(tile, hash);
         if let Arrival::First(place, holders) = arrival {
             if tiles.free_count() == 0 {
                 self.with_free.remove(&name.job);
             }
-            if has_lease {
-                self.on_tile(name.id, now);
-            }
+            self.on_tile(name.id, now);
             for holder in holders.iter() {
-                self.drop_tile(holder, place);
+                self.drop_tile(holder, place, now);
             }
         }
         Some(arrival)
@@ -267,8 +280,9 @@ impl Leases {
         Some(tiles.done_count())
     }
 
-    /// Event: a tile came under a lease, which is not quiet therefore.
+    /// Event: a tile came under a lease, which is not quiet therefore and lives on.
     fn on_tile(&mut self, id: LeaseId, now: Instant) {
+        self.renew(id, now);
         if let Some(lease) = self.held.get_mut(&id) {
             if self.last_tiles.remove(&(lease.last_tile, id)) {
                 self.last_tiles.insert((now, id));
@@ -278,14 +292,20 @@ impl Leases {
     }
 
     /// Takes a tile whose pixels came out of a lease, which ends with its last tile.
-    fn drop_tile(&mut self, id: LeaseId, place: Place) {
+    fn drop_tile(&mut self, id: LeaseId, place: Place, now: Instant) {
         let Some(lease) = self.held.get_mut(&id) else { return };
         lease.shared.remove(&place);
         if lease.alone.remove(&place) && lease.alone.is_empty() {
             self.last_tiles.remove(&(lease.last_tile, id));
         }
         if lease.alone.is_empty() && lease.shared.is_empty() {
+            let of_worker = (lease.worker, id)..=(lease.worker, LeaseId(u64::MAX));
             self.remove(id);
+            // The turn of the next comes now.
+            let later: Vec<LeaseId> = self.by_worker.range(of_worker).map(|&(_, id)| id).collect();
+            for next in later {
+                self.renew(next, now);
+            }
         }
     }
 
@@ -295,7 +315,14 @@ impl Leases {
         while let Some(&(until, id)) = self.expiries.first()
             && until <= now
         {
-            losses.extend(self.lose(id));
+            // Its worker comes to it after what it was leased before.
+            let worker = self.held[&id].worker;
+            let earlier = self.by_worker.range((worker, LeaseId(0))..(worker, id)).next();
+            if earlier.is_some() {
+                self.renew(id, now);
+            } else {
+                losses.extend(self.lose(id));
+            }
         }
         losses
     }
@@ -401,6 +428,10 @@ mod tests {
         LeaseName { job: JOB, id: LeaseId(id) }
     }
 
+    fn renewal(id: u64, work: u64) -> Renewal {
+        Renewal { lease: lease(id), work }
+    }
+
     /// A job of `columns` x `rows` tiles.
     fn job(columns: u64, rows: u64) -> (Leases, Instant) {
         let grid = TileGrid::new(Size::new(columns * 16, rows * 16).unwrap(), 16).unwrap();
@@ -439,7 +470,7 @@ mod tests {
         let (mut leases, tiles, start) = all_leased(5);
         deliver(&mut leases, A, 1, tiles[0], start);
         assert_eq!(leases.on_time(start + TERM / 2), []);
-        assert!(leases.on_progress(A, lease(1), start + TERM / 2));
+        assert!(leases.on_renewal(A, renewal(1, 1), start + TERM / 2));
         assert_eq!(leases.on_time(start + TERM), [], "progress renews it");
         assert_eq!(leases.next_expiry(), Some(start + TERM * 3 / 2));
 
@@ -447,16 +478,62 @@ mod tests {
         let rest = tiles[1..].to_vec();
         assert_eq!(lost, [Loss { lease: lease(1), worker: A, tiles: rest.clone() }]);
         leases.check(|_| true);
-        assert!(!leases.on_progress(A, lease(1), start + TERM * 2));
+        assert!(!leases.on_renewal(A, renewal(1, 2), start + TERM * 2));
         let run = leases.on_idle(B, JOB, (8, 1), 64, start + TERM * 2).unwrap();
         assert_eq!(run.tiles, rest);
     }
 
     #[test]
+    fn a_renewal_without_new_work_keeps_no_lease_alive() {
+        let (mut leases, _, start) = all_leased(2);
+        assert!(leases.on_renewal(A, renewal(1, 7), start + TERM / 4));
+        for (work, quarter) in [(7, 2), (0, 3), (6, 4)] {
+            assert!(leases.on_renewal(A, renewal(1, work), start + TERM * quarter / 4));
+        }
+        assert_eq!(leases.on_time(start + TERM * 5 / 4).len(), 1);
+    }
+
+    #[test]
+    fn one_lease_does_not_live_on_the_work_of_another() {
+        let (mut leases, start) = job(4, 1);
+        for id in 1..=2 {
+            assert_eq!(leases.on_idle(A, JOB, (1, 1), 1, start).unwrap().lease, lease(id));
+        }
+        assert!(leases.on_renewal(A, renewal(2, 1), start + TERM / 2));
+        let lost = leases.on_time(start + TERM);
+        assert_eq!(lost.iter().map(|loss| loss.lease).collect::<Vec<_>>(), [lease(1)]);
+    }
+
+    #[test]
+    fn a_lease_waits_for_those_that_its_worker_got_before() {
+        let (mut leases, start) = job(4, 1);
+        for id in 1..=2 {
+            assert_eq!(leases.on_idle(A, JOB, (1, 1), 1, start).unwrap().lease, lease(id));
+        }
+        for work in 1..9 {
+            let now = start + TERM * work / 2;
+            assert!(leases.on_renewal(A, renewal(1, work.into()), now));
+            assert_eq!(leases.on_time(now), [], "its tiles are not begun");
+            leases.check(|_| true);
+        }
+        assert_eq!(leases.on_time(start + TERM * 6).len(), 2, "nothing goes on");
+    }
+
+    #[test]
+    fn a_lease_whose_turn_comes_has_a_whole_term() {
+        let (mut leases, start) = job(4, 1);
+        let runs = [(); 2].map(|()| leases.on_idle(A, JOB, (1, 1), 1, start).unwrap());
+        deliver(&mut leases, A, 1, runs[0].tiles[0], start + TERM * 3 / 4);
+        assert_eq!(leases.on_time(start + TERM), []);
+        assert_eq!(leases.on_time(start + TERM * 7 / 4).len(), 1);
+    }
+
+    #[test]
     fn nobody_renews_the_lease_of_another_worker_or_job() {
         let (mut leases, _, start) = all_leased(2);
-        assert!(!leases.on_progress(B, lease(1), start));
-        assert!(!leases.on_progress(A, LeaseName { job: JobId(2), ..lease(1) }, start));
+        assert!(!leases.on_renewal(B, renewal(1, 1), start));
+        let other_job = LeaseName { job: JobId(2), ..lease(1) };
+        assert!(!leases.on_renewal(A, Renewal { lease: other_job, work: 1 }, start));
         assert_eq!(leases.on_time(start + TERM).len(), 1);
     }
 
@@ -520,7 +597,7 @@ mod tests {
         leases.on_end(JOB);
         leases.check(|_| true);
         assert!(leases.is_empty() && !leases.has_free());
-        assert!(!leases.on_progress(A, lease(1), start));
+        assert!(!leases.on_renewal(A, renewal(1, 1), start));
         assert_eq!(leases.on_pixels(A, lease(1), tiles[0], [0; 32], start), None);
         assert_eq!(leases.on_stored(JOB, tiles[0]), None);
     }

@@ -17,8 +17,8 @@ use rtfarm_core::{
 use rtfarm_job::{Outcome, Placed, Progress, Refusal, RenderRequest};
 use rtfarm_picture::check_pixels;
 use rtfarm_proto::{
-    CHUNK_BYTES, JobId, LONGEST_WAIT, LeaseName, MESSAGE_BYTES, PROTOCOL, WireError, WorkerId,
-    pixels_from_bytes, scene_hash, transfer,
+    CHUNK_BYTES, JobId, LONGEST_WAIT, LeaseName, MESSAGE_BYTES, PROTOCOL, Renewal, WireError,
+    WorkerId, pixels_from_bytes, scene_hash, transfer,
     wire::{
         self, event, farm_server, jobs_server, lease_response, submit_request, submit_response,
     },
@@ -122,10 +122,11 @@ impl farm_server::Farm for FarmService {
         &self,
         request: Request<wire::RenewRequest>,
     ) -> Result<Response<wire::RenewResponse>, Status> {
-        let wire::RenewRequest { worker, leases, incarnation } = request.into_inner();
+        let wire::RenewRequest { worker, renewals, incarnation } = request.into_inner();
         self.shell.admit(incarnation).map_err(stranger)?;
-        let leases: Vec<LeaseName> = leases.into_iter().map(LeaseName::from).collect();
-        let lost = self.shell.renew(WorkerId(worker), &leases).map_err(no_member)?;
+        let renewals = renewals.into_iter().map(Renewal::try_from);
+        let renewals = renewals.collect::<Result<Vec<Renewal>, WireError>>().map_err(invalid)?;
+        let lost = self.shell.renew(WorkerId(worker), &renewals).map_err(no_member)?;
         let lost = lost.into_iter().map(Into::into).collect();
         Ok(Response::new(wire::RenewResponse { lost }))
     }

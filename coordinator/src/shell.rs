@@ -13,7 +13,7 @@ use std::{
 use rtfarm_core::{prepared::SceneHash, tile::TileId};
 use rtfarm_job::{FinishedTile, Order, Progress};
 use rtfarm_picture::Picture;
-use rtfarm_proto::{Incarnation, JobId, LeaseName, TileHasher, WorkerId};
+use rtfarm_proto::{Incarnation, JobId, LeaseName, Renewal, TileHasher, WorkerId};
 use tokio::sync::{Notify, oneshot, watch};
 use tokio_util::sync::CancellationToken;
 
@@ -249,9 +249,9 @@ impl Shell {
     pub(crate) fn renew(
         &self,
         worker: WorkerId,
-        leases: &[LeaseName],
+        renewals: &[Renewal],
     ) -> Result<Vec<LeaseName>, NoMember> {
-        self.tell(|state, now| (state.farm.on_renew(worker, leases, now), Vec::new()))
+        self.tell(|state, now| (state.farm.on_renew(worker, renewals, now), Vec::new()))
     }
 
     /// A tile of a job that is being rendered, and that job.

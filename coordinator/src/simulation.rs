@@ -13,7 +13,7 @@ use rtfarm_core::{
     tile::{Size, TileGrid, TileId},
 };
 use rtfarm_job::Outcome;
-use rtfarm_proto::{Incarnation, JobId, LeaseId, LeaseName, WorkerId};
+use rtfarm_proto::{Incarnation, JobId, LeaseId, LeaseName, Renewal, WorkerId};
 
 use crate::{
     farm::{Action, Delivery, DeliveryId, Farm, Next, Notice, Verdict},
@@ -78,6 +78,8 @@ struct Renderer {
     incarnation: Incarnation,
     /// Tiles to be rendered, and what their scenes show.
     queue: VecDeque<(LeaseName, TileId, u8)>,
+    /// Tiles that it has rendered: a counter that rises under every lease.
+    work: u64,
     /// Its question, while it waits.
     ask: Option<AskId>,
     stopped_until: Instant,
@@ -338,7 +340,14 @@ impl World {
             let (worker, stopped_until) = (self.join(), self.now);
             let queue = VecDeque::new();
             let incarnation = self.farm.incarnation();
-            self.renderers.push(Renderer { worker, incarnation, queue, ask: None, stopped_until });
+            self.renderers.push(Renderer {
+                worker,
+                incarnation,
+                queue,
+                work: 0,
+                ask: None,
+                stopped_until,
+            });
         }
         let index = self.random.below(self.renderers.len() as u64) as usize;
         match self.random.below(40) {
@@ -407,15 +416,23 @@ impl World {
             self.post.push((self.now + delay, incarnation, delivery));
         }
         let is_admitted = self.is_admitted(incarnation);
-        let Renderer { worker, queue, .. } = &mut self.renderers[index];
+        let Renderer { worker, queue, work, .. } = &mut self.renderers[index];
         if !is_admitted {
             // Another start of the farm: what was to be rendered for the last is of no use.
             queue.clear();
             *worker = WorkerId(0);
             return;
         }
-        let names: Vec<LeaseName> = queue.iter().map(|&(lease, ..)| lease).collect();
-        if let Ok(lost) = self.farm.on_renew(*worker, &names, self.now) {
+        // Work is done under the lease of the tile, if any of it is left.
+        *work += 1;
+        let renewals: Vec<Renewal> = queue
+            .iter()
+            .map(|&(other, ..)| Renewal {
+                lease: other,
+                work: if other == lease { *work } else { 0 },
+            })
+            .collect();
+        if let Ok(lost) = self.farm.on_renew(*worker, &renewals, self.now) {
             queue.retain(|(lease, ..)| !lost.contains(lease));
         } else {
             queue.clear();

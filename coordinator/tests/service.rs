@@ -193,7 +193,7 @@ async fn a_lease_without_progress_is_given_again_and_late_pixels_count() {
     };
     let renewal = wire::RenewRequest {
         worker: farm.worker,
-        leases: vec![late.into()],
+        renewals: vec![wire::Renewal { lease: Some(late.into()), work: 1 }],
         incarnation: farm.incarnation,
     };
     let lost = farm.tiles.renew(renewal).await.unwrap().into_inner().lost;
@@ -334,8 +334,8 @@ async fn calls_meant_for_another_start_of_the_coordinator_are_refused() {
     let status = farm.tiles.lease(request).await.unwrap_err();
     assert_eq!(status.code(), Code::NotFound);
     assert!(status.message().contains("not meant for this start"), "{status}");
-    let leases = vec![lease.into()];
-    let request = wire::RenewRequest { worker, incarnation, leases };
+    let renewals = vec![wire::Renewal { lease: Some(lease.into()), work: 1 }];
+    let request = wire::RenewRequest { worker, incarnation, renewals };
     assert_eq!(farm.tiles.renew(request).await.unwrap_err().code(), Code::NotFound);
     let request = wire::LeaveRequest { worker, incarnation, reason: String::new() };
     assert_eq!(farm.tiles.leave(request).await.unwrap_err().code(), Code::NotFound);

@@ -9,7 +9,7 @@ mod tile_hash;
 
 pub use address::{Address, AddressError};
 pub use convert::{WireError, pixels_from_bytes, pixels_to_bytes, scene_hash, transfer};
-pub use name::{FarmId, Incarnation, JobId, LeaseId, LeaseName, WorkerId};
+pub use name::{FarmId, Incarnation, JobId, LeaseId, LeaseName, Renewal, WorkerId};
 pub use prost::bytes::Bytes;
 pub use tile_hash::TileHasher;
 

@@ -2,7 +2,7 @@
 
 use std::fmt;
 
-use crate::wire;
+use crate::{WireError, wire};
 
 /// A farm: random, so that no two have the same.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -35,6 +35,15 @@ pub struct LeaseName {
     pub id: LeaseId,
 }
 
+/// How far the work under a lease is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Renewal {
+    /// The lease.
+    pub lease: LeaseName,
+    /// Steps that were made for its own tiles, since it began.
+    pub work: u64,
+}
+
 impl fmt::Display for FarmId {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "{:032x}", u128::from_be_bytes(self.0))
@@ -56,6 +65,21 @@ impl fmt::Display for JobId {
 impl From<wire::LeaseName> for LeaseName {
     fn from(name: wire::LeaseName) -> Self {
         Self { job: JobId(name.job), id: LeaseId(name.id) }
+    }
+}
+
+impl TryFrom<wire::Renewal> for Renewal {
+    type Error = WireError;
+
+    fn try_from(renewal: wire::Renewal) -> Result<Self, WireError> {
+        let lease = renewal.lease.ok_or(WireError::Missing("lease"))?.into();
+        Ok(Self { lease, work: renewal.work })
+    }
+}
+
+impl From<Renewal> for wire::Renewal {
+    fn from(renewal: Renewal) -> Self {
+        Self { lease: Some(renewal.lease.into()), work: renewal.work }
     }
 }
 

@@ -3,7 +3,7 @@
 use std::{sync::Arc, time::Duration};
 
 use rtfarm_core::{render::Tally, tile::TileId};
-use rtfarm_proto::{Bytes, FarmId, Incarnation, LONGEST_WAIT, LeaseName, WorkerId};
+use rtfarm_proto::{Bytes, FarmId, Incarnation, LONGEST_WAIT, LeaseName, Renewal, WorkerId};
 
 use crate::job::Job;
 
@@ -23,8 +23,8 @@ pub(crate) enum Call {
     Join,
     /// Asks for tiles; the answer may take as long as `wait`.
     Lease { member: Membership, most_tiles: usize, wait: Duration },
-    /// Proves progress under these leases.
-    Renew { member: Membership, leases: Vec<LeaseName> },
+    /// Proves progress under leases.
+    Renew { member: Membership, renewals: Vec<Renewal> },
     /// Brings a tile.
     Deliver { member: Membership, tile: Delivery },
     /// Gives every lease back.

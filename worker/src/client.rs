@@ -72,11 +72,11 @@ pub(crate) async fn ask(
             let answer = client.lease(request).await?.into_inner();
             Ok(Answer::Leased(read_next(answer, member.incarnation)?))
         }
-        Call::Renew { member, leases } => {
+        Call::Renew { member, renewals } => {
             let request = wire::RenewRequest {
                 worker: member.worker.0,
                 incarnation: member.incarnation.0,
-                leases: leases.into_iter().map(Into::into).collect(),
+                renewals: renewals.into_iter().map(Into::into).collect(),
             };
             let renewed = client.renew(request).await?;
             let lost = renewed.into_inner().lost.into_iter().map(Into::into).collect();

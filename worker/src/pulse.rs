@@ -1,10 +1,16 @@
 //! Carries signs of progress from the threads that render to where the worker decides.
 
 use std::{
-    sync::atomic::{AtomicU64, Ordering},
+    collections::BTreeMap,
+    mem,
+    sync::{
+        Mutex, PoisonError,
+        atomic::{AtomicU64, Ordering},
+    },
     time::Duration,
 };
 
+use rtfarm_proto::LeaseName;
 use tokio::{sync::mpsc, time::Instant};
 
 /// Whoever makes progress beats it; it is heard at most once a period.
@@ -15,17 +21,21 @@ pub(crate) struct Pulse {
     /// Milliseconds from `start`.
     next_beat: AtomicU64,
     send: mpsc::Sender<()>,
+    /// Beats under each lease that nobody has counted yet.
+    beats: Mutex<BTreeMap<LeaseName, u64>>,
 }
 
 impl Pulse {
     /// Makes a pulse, and the place where its beats are heard.
     pub(crate) fn new(period: Duration) -> (Self, mpsc::Receiver<()>) {
         let (send, receive) = mpsc::channel(1);
-        (Self { start: Instant::now(), period, next_beat: AtomicU64::new(0), send }, receive)
+        let (start, next_beat) = (Instant::now(), AtomicU64::new(0));
+        (Self { start, period, next_beat, send, beats: Mutex::default() }, receive)
     }
 
-    /// Event: some work was done.
-    pub(crate) fn beat(&self) {
+    /// Event: some work was done for a tile of a lease.
+    pub(crate) fn beat(&self, lease: LeaseName) {
+        *self.beats.lock().unwrap_or_else(PoisonError::into_inner).entry(lease).or_default() += 1;
         let now = self.start.elapsed().as_millis() as u64;
         let next = self.next_beat.load(Ordering::Relaxed);
         let after = now + self.period.as_millis() as u64;
@@ -38,5 +48,10 @@ impl Pulse {
             // When the channel is full, a beat waits to be heard already.
             let _ = self.send.try_send(());
         }
+    }
+
+    /// Counts the beats under each lease since they were counted last.
+    pub(crate) fn count(&self) -> BTreeMap<LeaseName, u64> {
+        mem::take(&mut *self.beats.lock().unwrap_or_else(PoisonError::into_inner))
     }
 }

@@ -61,7 +61,7 @@ pub async fn run(
                 shell.renderings.remove(&task);
                 worker.on_tile_rendered(task, tile, now());
             }
-            Some(()) = shell.beats.recv() => worker.on_beat(now()),
+            Some(()) = shell.beats.recv() => worker.on_beat(&shell.pulse.count(), now()),
             () = sleep_until(worker.wake_at()) => worker.on_tick(now()),
             grace = &mut shutdown, if !is_stopped => {
                 is_stopped = true;
@@ -156,7 +156,7 @@ impl Shell {
     fn execute(&mut self, action: Action) -> ControlFlow<Result<(), WorkerError>> {
         match action {
             Action::Call(task, call) => self.call(task, call),
-            Action::Fetch { task, job, silence } => self.fetch(task, job, silence),
+            Action::Fetch { task, job, lease, silence } => self.fetch(task, job, lease, silence),
             Action::Render { task, lease, tile, job } => self.render(task, lease, tile, job),
             Action::Stop(task) => {
                 self.renderings.remove(&task);
@@ -188,12 +188,12 @@ impl Shell {
         });
     }
 
-    fn fetch(&mut self, task: TaskId, job: Arc<Job>, silence: Duration) {
+    fn fetch(&mut self, task: TaskId, job: Arc<Job>, lease: LeaseName, silence: Duration) {
         let client = self.client.clone().expect("a worker connects before it fetches");
         let (scene, pulse) = (job.scene, Arc::clone(&self.pulse));
         let is_local = matches!(self.config.coordinator, Address::Unix(_));
         self.start(task, async move {
-            match load(job, is_local, silence, client, pulse).await {
+            match load(job, lease, is_local, silence, client, pulse).await {
                 Ok(loaded) => Report::Fetched(scene, loaded),
                 Err(error) => Report::FetchFailed(error),
             }
@@ -241,7 +241,7 @@ impl Shell {
         self.pool.spawn_fifo(move || {
             let started = Instant::now();
             let mut on_progress = || {
-                pulse.beat();
+                pulse.beat(lease);
                 if is_stopped.load(Ordering::Relaxed) {
                     ControlFlow::Break(())
                 } else {

@@ -10,7 +10,10 @@ use std::{
 };
 
 use rtfarm_core::prepared::{PreparedError, PreparedScene};
-use rtfarm_proto::wire::{self, farm_client::FarmClient};
+use rtfarm_proto::{
+    LeaseName,
+    wire::{self, farm_client::FarmClient},
+};
 use rustix::fs::OFlags;
 use tonic::{Code, Status, transport::Channel};
 
@@ -53,11 +56,12 @@ impl From<Status> for SceneError {
     }
 }
 
-/// Brings a job's scene into memory. Every sign of progress beats `pulse`; no piece of the scene
-/// may take the coordinator longer than `silence`. Only a coordinator that is certainly on this
-/// machine, `is_local`, can know where the scene is here.
+/// Brings the scene of a job of which tiles are leased into memory. Every sign of progress beats
+/// `pulse`; no piece of the scene may take the coordinator longer than `silence`. Only a
+/// coordinator that is certainly on this machine, `is_local`, can know where the scene is here.
 pub(crate) async fn load(
     job: Arc<Job>,
+    lease: LeaseName,
     is_local: bool,
     silence: Duration,
     client: FarmClient<Channel>,
@@ -65,9 +69,10 @@ pub(crate) async fn load(
 ) -> Result<Arc<Scene>, SceneError> {
     let file = match &job.scene_path {
         Some(path) if is_local => find(path)?,
-        _ => fetch(&job, silence, client, &pulse).await?,
+        _ => fetch(&job, silence, client, &|| pulse.beat(lease)).await?,
     };
-    let opened = tokio::task::spawn_blocking(move || open(&file, &job, &pulse)).await;
+    let opened =
+        tokio::task::spawn_blocking(move || open(&file, &job, &|| pulse.beat(lease))).await;
     opened.map_err(io::Error::other)?
 }
 
@@ -92,7 +97,7 @@ async fn fetch(
     job: &Job,
     silence: Duration,
     mut client: FarmClient<Channel>,
-    pulse: &Pulse,
+    beat: &(dyn Fn() + Sync),
 ) -> Result<File, SceneError> {
     // The file has no name, so that nothing stays behind.
     let mut file = tempfile::tempfile()?;
@@ -112,17 +117,17 @@ async fn fetch(
             return Err(SceneError::Hash);
         }
         file.write_all(&chunk.data)?;
-        pulse.beat();
+        beat();
     }
     Ok(file)
 }
 
-fn open(file: &File, job: &Job, pulse: &Pulse) -> Result<Arc<Scene>, SceneError> {
-    let scene = PreparedScene::open_in_steps(Map::new(file)?, &mut || pulse.beat())?;
+fn open(file: &File, job: &Job, beat: &dyn Fn()) -> Result<Arc<Scene>, SceneError> {
+    let scene = PreparedScene::open_in_steps(Map::new(file)?, &mut || beat())?;
     if scene.hash() != job.scene {
         return Err(SceneError::Hash);
     }
-    pulse.beat();
+    beat();
     Ok(Arc::new(scene))
 }
 
@@ -133,7 +138,7 @@ mod tests {
         render::{Quality, Settings},
         tile::{Size, TileGrid},
     };
-    use rtfarm_proto::{Address, Incarnation, JobId, TileHasher};
+    use rtfarm_proto::{Address, Incarnation, JobId, LeaseId, TileHasher};
     use rustix::fs::{CWD, FileType, Mode, mknodat};
     use tonic::transport::Endpoint;
 
@@ -155,7 +160,8 @@ mod tests {
         let nowhere = Address::Tcp("127.0.0.1:1".to_owned()).to_string();
         let client = FarmClient::new(Endpoint::from_shared(nowhere).unwrap().connect_lazy());
         let (pulse, _beats) = Pulse::new(Duration::ZERO);
-        load(Arc::new(job), is_local, Duration::from_secs(20), client, Arc::new(pulse)).await
+        let lease = LeaseName { job: JobId(1), id: LeaseId(1) };
+        load(Arc::new(job), lease, is_local, Duration::from_secs(20), client, Arc::new(pulse)).await
     }
 
     #[tokio::test]

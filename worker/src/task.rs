@@ -27,8 +27,9 @@ pub(crate) struct TaskId(u64);
 pub(crate) enum Action {
     /// Make a call.
     Call(TaskId, Call),
-    /// Bring a job's scene into memory. No piece of it may take longer than `silence`.
-    Fetch { task: TaskId, job: Arc<Job>, silence: Duration },
+    /// Bring the scene of a job into memory, of which tiles are leased. No piece of it may take
+    /// longer than `silence`.
+    Fetch { task: TaskId, job: Arc<Job>, lease: LeaseName, silence: Duration },
     /// Render a tile of a job whose scene is in memory; those that came earlier go first.
     Render { task: TaskId, lease: LeaseName, tile: TileId, job: Arc<Job> },
     /// Stop a task. A call or a fetch does not report any more; a rendering does so soon.
@@ -141,9 +142,9 @@ impl Tasks {
     }
 
     /// Begins to bring a scene into memory.
-    pub(crate) fn fetch(&mut self, job: Arc<Job>, silence: Duration) {
+    pub(crate) fn fetch(&mut self, job: Arc<Job>, lease: LeaseName, silence: Duration) {
         let task = self.begin(Task::Fetch);
-        self.actions.push_back(Action::Fetch { task, job, silence });
+        self.actions.push_back(Action::Fetch { task, job, lease, silence });
     }
 
     /// Begins to render a tile.

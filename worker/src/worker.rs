@@ -10,7 +10,7 @@ use std::{
 };
 
 use rtfarm_core::{prepared::SceneHash, tile::TileId};
-use rtfarm_proto::{Address, LONGEST_WAIT, LeaseName};
+use rtfarm_proto::{Address, LONGEST_WAIT, LeaseName, Renewal};
 
 use crate::{
     call::{Answer, Call, CallError, CallErrorKind, Delivery, Membership, Next, Run},
@@ -68,9 +68,8 @@ enum Stage {
 struct Member {
     id: Membership,
     threads: usize,
-    /// The leases that this worker knows to have, and the tiles of each that are not on their way
-    /// to the coordinator yet: at least one.
-    leases: BTreeMap<LeaseName, usize>,
+    /// The leases that this worker knows to have.
+    leases: BTreeMap<LeaseName, Held>,
     /// A run whose scene is being brought into memory.
     fetching: Option<Run>,
     /// Scenes in memory, the latest last.
@@ -85,8 +84,17 @@ struct Member {
     delivering_count: usize,
     is_leasing: bool,
     is_renewing: bool,
-    /// Whether there was progress that the coordinator has not been told of.
-    has_beaten: bool,
+}
+
+/// A lease that this worker has.
+#[derive(Debug)]
+struct Held {
+    /// Tiles that are not on their way to the coordinator yet: at least one.
+    tiles_left: usize,
+    /// Signs of progress under it.
+    work: u64,
+    /// Those of them that the coordinator was told of.
+    told: u64,
 }
 
 #[derive(Debug)]
@@ -202,11 +210,14 @@ impl Worker {
         }
     }
 
-    /// Event: a thread or a fetch has made progress.
-    pub(crate) fn on_beat(&mut self, now: Instant) {
+    /// Event: threads or a fetch have made so much progress under leases since the last time.
+    pub(crate) fn on_beat(&mut self, beats: &BTreeMap<LeaseName, u64>, now: Instant) {
         if let Stage::Working(member) = &mut self.stage {
-            // Without a lease there is nothing that progress could prove.
-            member.has_beaten = !member.leases.is_empty();
+            for (lease, count) in beats {
+                if let Some(held) = member.leases.get_mut(lease) {
+                    held.work += count;
+                }
+            }
             self.proceed(now);
         }
     }
@@ -321,7 +332,6 @@ impl Member {
             delivering_count: 0,
             is_leasing: false,
             is_renewing: false,
-            has_beaten: false,
         }
     }
 
@@ -329,11 +339,12 @@ impl Member {
         if run.tiles.is_empty() {
             return;
         }
-        self.leases.insert(run.lease, run.tiles.len());
+        let held = Held { tiles_left: run.tiles.len(), work: 0, told: 0 };
+        self.leases.insert(run.lease, held);
         if self.scenes.contains(&run.job.scene) {
             self.queue(run);
         } else {
-            tasks.fetch(Arc::clone(&run.job), CHUNK_DEADLINE);
+            tasks.fetch(Arc::clone(&run.job), run.lease, CHUNK_DEADLINE);
             self.fetching = Some(run);
         }
     }
@@ -384,18 +395,22 @@ impl Member {
         }
         self.forget_scenes(tasks);
 
-        let tiles_left: usize = self.leases.values().sum();
+        let tiles_left: usize = self.leases.values().map(|held| held.tiles_left).sum();
         let is_short = tiles_left < TILES_AHEAD * self.threads;
         if is_short && !is_draining && !self.is_leasing && self.fetching.is_none() {
             self.is_leasing = true;
             let most_tiles = LONGEST_RUN_A_THREAD * self.threads;
             tasks.call(Call::Lease { member: self.id, most_tiles, wait: LONGEST_WAIT }, now);
         }
-        if self.has_beaten && !self.is_renewing && !self.leases.is_empty() {
-            self.has_beaten = false;
+        let has_news = self.leases.values().any(|held| held.work > held.told);
+        if has_news && !self.is_renewing {
             self.is_renewing = true;
-            let leases = self.leases.keys().copied().collect();
-            tasks.call(Call::Renew { member: self.id, leases }, now);
+            let renewals = self.leases.iter_mut().map(|(&lease, held)| {
+                held.told = held.work;
+                Renewal { lease, work: held.work }
+            });
+            let renewals = renewals.collect();
+            tasks.call(Call::Renew { member: self.id, renewals }, now);
         }
     }
 
@@ -410,9 +425,9 @@ impl Member {
     }
 
     fn on_tile_sent(&mut self, name: LeaseName) {
-        if let Some(tiles_left) = self.leases.get_mut(&name) {
-            *tiles_left -= 1;
-            if *tiles_left == 0 {
+        if let Some(held) = self.leases.get_mut(&name) {
+            held.tiles_left -= 1;
+            if held.tiles_left == 0 {
                 self.leases.remove(&name);
             }
         }

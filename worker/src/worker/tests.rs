@@ -228,8 +228,9 @@ impl Bench {
         (lease, tile)
     }
 
-    fn beat(&mut self) {
-        self.worker.on_beat(self.now);
+    /// A sign of progress under a lease.
+    fn beat(&mut self, number: u64) {
+        self.worker.on_beat(&BTreeMap::from([(lease(number), 1)]), self.now);
         self.absorb();
     }
 
@@ -316,26 +317,29 @@ fn pixels_are_kept_until_they_are_acknowledged() {
 }
 
 #[test]
-fn progress_renews_every_lease_one_renewal_at_a_time() {
+fn progress_renews_its_own_lease_one_renewal_at_a_time() {
     let mut bench = Bench::rendering(1, 1);
     bench.answer(is_lease, run(2, 9, 0));
     assert!(!bench.has(is_renew), "time alone renews nothing");
-    bench.beat();
-    bench.beat();
-    let first = bench.answer(is_renew, Answer::Renewed { lost: vec![] });
-    let leases = vec![lease(1), lease(2)];
-    assert_eq!(first, Call::Renew { member: member(1), leases });
-    bench.answer(is_renew, Answer::Renewed { lost: vec![] });
+    bench.beat(1);
+    bench.beat(1);
+    bench.beat(2);
+    for works in [[1, 0], [2, 1]] {
+        let renewed = bench.answer(is_renew, Answer::Renewed { lost: vec![] });
+        let renewal = |(number, work)| Renewal { lease: lease(number), work };
+        let renewals = (1..).zip(works).map(renewal).collect();
+        assert_eq!(renewed, Call::Renew { member: member(1), renewals });
+    }
     assert!(!bench.has(is_renew), "nothing new to tell");
 }
 
 #[test]
 fn nothing_is_renewed_without_a_lease() {
     let mut bench = Bench::joined(1);
-    bench.beat();
+    bench.beat(1);
     bench.answer(is_lease, run(1, 1, 0));
     assert!(!bench.has(is_renew));
-    bench.beat();
+    bench.beat(1);
     assert!(bench.has(is_renew), "a fetch makes progress too");
 }
 
@@ -343,7 +347,7 @@ fn nothing_is_renewed_without_a_lease() {
 fn a_lost_lease_is_rendered_no_further_but_its_pixels_are_delivered() {
     let mut bench = Bench::rendering(1, 9);
     let (name, tile) = bench.render();
-    bench.beat();
+    bench.beat(1);
     bench.answer(is_renew, Answer::Renewed { lost: vec![lease(1)] });
     assert_eq!(bench.stopped.len(), TILES_AT_HAND);
     while !bench.renderings.is_empty() {
@@ -358,7 +362,7 @@ fn a_lost_lease_is_rendered_no_further_but_its_pixels_are_delivered() {
 fn a_lease_lost_while_its_scene_is_fetched_is_not_rendered() {
     let mut bench = Bench::joined(1);
     bench.answer(is_lease, run(1, 9, 0));
-    bench.beat();
+    bench.beat(1);
     bench.answer(is_renew, Answer::Renewed { lost: vec![lease(1)] });
     bench.fetch();
     assert!(bench.renderings.is_empty() && bench.has(is_lease));
@@ -423,7 +427,7 @@ fn a_scene_that_is_gone_costs_its_lease_and_not_the_worker() {
     bench.worker.on_fetch_failed(task, gone, bench.now);
     bench.absorb();
     assert_eq!(bench.exit, None);
-    bench.beat();
+    bench.beat(1);
     assert!(!bench.has(is_renew), "the lease is dropped");
     bench.answer(is_lease, run(2, 1, 1));
     bench.fetch();
@@ -436,7 +440,7 @@ fn a_forgotten_worker_stops_everything_and_joins_again() {
     let mut bench = Bench::rendering(1, 9);
     bench.render();
     let late = bench.find(is_deliver);
-    bench.beat();
+    bench.beat(1);
     bench.fail(is_renew, failure(CallErrorKind::NotMember));
     assert_eq!(bench.stopped.len(), bench.renderings.len());
     assert!(bench.scenes.is_empty());
@@ -580,7 +584,7 @@ fn a_run_without_tiles_is_nothing() {
     let mut bench = Bench::joined(1);
     bench.answer(is_lease, run(1, 0, 0));
     assert!(bench.fetches.is_empty() && bench.has(is_lease));
-    bench.beat();
+    bench.beat(1);
     assert!(!bench.has(is_renew));
 }
 
@@ -667,7 +671,7 @@ enum Letter {
     Fetched(TaskId, SceneHash),
     /// A thread is done.
     Rendered(TaskId),
-    Beat,
+    Beat(LeaseName),
 }
 
 /// A coordinator that forgets, and a network that delays and loses.
@@ -716,8 +720,9 @@ impl Chance {
                 is_member(self, member)?;
                 Ok(Answer::Leased(self.lease(most_tiles)))
             }
-            Call::Renew { member, leases } => {
+            Call::Renew { member, renewals } => {
                 is_member(self, member)?;
+                let leases: Vec<LeaseName> = renewals.iter().map(|told| told.lease).collect();
                 let gone = self.random.below(20);
                 self.take_back(|name| leases.contains(name) && name.id.0 % 20 == gone);
                 let known = &self.leases;
@@ -788,10 +793,10 @@ fn simulate(seed: u64) {
                 chance.post(bench.now, Letter::Fetched(task, scene));
             }
         }
-        for &task in bench.renderings.keys() {
+        for (&task, &(lease, _)) in &bench.renderings {
             if posted.insert(task) {
                 chance.post(bench.now, Letter::Rendered(task));
-                chance.post(bench.now, Letter::Beat);
+                chance.post(bench.now, Letter::Beat(lease));
             }
         }
         if let Some(exit) = bench.exit {
@@ -834,7 +839,9 @@ fn simulate(seed: u64) {
                 let pixels = (!bench.stopped.remove(&task)).then(|| delivery(lease, tile));
                 bench.worker.on_tile_rendered(task, pixels, bench.now);
             }
-            Letter::Beat => bench.worker.on_beat(bench.now),
+            Letter::Beat(lease) => {
+                bench.worker.on_beat(&BTreeMap::from([(lease, 1)]), bench.now);
+            }
         }
         bench.absorb();
     }
