@@ -1,0 +1,531 @@
+use rtfarm_core::tile::{Size, TileGrid};
+
+use super::*;
+
+const TERM: Duration = Duration::from_secs(4);
+const SECOND: Duration = Duration::from_secs(1);
+
+/// A farm and its clock.
+struct World {
+    farm: Farm,
+    now: Instant,
+    last_number: u64,
+}
+
+impl World {
+    fn new() -> Self {
+        #[expect(clippy::disallowed_methods, reason = "any instant will do")]
+        let now = Instant::now();
+        let identity = Identity::from_random([1; 24]);
+        Self { farm: Farm::new(identity, TERM), now, last_number: 0 }
+    }
+
+    fn number(&mut self) -> u64 {
+        self.last_number += 1;
+        self.last_number
+    }
+
+    fn join(&mut self) -> WorkerId {
+        let nonce = self.number();
+        let process = Process { nonce, number: nonce as u32, threads: 1, ..Process::default() };
+        self.farm.on_join(process, self.now).0
+    }
+
+    /// Orders a picture of a row of tiles; answers also with what that leads to.
+    fn submit(&mut self, tile_count: u64) -> (JobId, Vec<Action>) {
+        let grid = TileGrid::new(Size::new(tile_count * 16, 16).unwrap(), 16).unwrap();
+        let job = self.farm.number_job();
+        let actions = self.farm.on_submit(job, Tiles::new(grid), self.now);
+        self.farm.check();
+        (job, actions)
+    }
+
+    /// Asks for up to nine tiles.
+    fn ask(&mut self, worker: WorkerId, wait: Duration) -> (AskId, Vec<Action>) {
+        let id = AskId(self.number());
+        let ask = Ask { worker, most: 9, until: self.now + wait };
+        let actions = self.farm.on_ask(id, ask, self.now);
+        self.farm.check();
+        (id, actions)
+    }
+
+    /// Asks and gets tiles at once.
+    fn lease(&mut self, worker: WorkerId) -> Run {
+        let (id, actions) = self.ask(worker, Duration::ZERO);
+        let [(answered, Ok(Next::Render(run)))] = &answers(&actions)[..] else {
+            panic!("{actions:?}")
+        };
+        assert_eq!(*answered, id);
+        run.clone()
+    }
+
+    fn deliver(&mut self, worker: WorkerId, run: &Run, hash: u8) -> (DeliveryId, Vec<Action>) {
+        let id = DeliveryId(self.number());
+        let delivery = Delivery {
+            worker,
+            lease: run.lease,
+            tile: run.tiles[0],
+            hash: [hash; 32],
+            seconds: 0.1,
+            tally: Tally { rays: 10, ..Tally::default() },
+        };
+        let actions = self.farm.on_pixels(id, delivery, self.now);
+        self.farm.check();
+        (id, actions)
+    }
+
+    fn senseless(&mut self, worker: WorkerId, run: &Run) -> Vec<Action> {
+        let (lease, tile) = (run.lease, run.tiles[0]);
+        let actions = self.farm.on_senseless_pixels(worker, lease, tile, "it is NaN", self.now);
+        self.farm.check();
+        actions
+    }
+
+    fn store(&mut self, run: &Run) -> Vec<Action> {
+        let actions = self.farm.on_stored(run.lease.job, run.tiles[0], self.now);
+        self.farm.check();
+        actions
+    }
+
+    /// Brings and stores the first tile of a run; answers with what the storing leads to.
+    fn stitch(&mut self, worker: WorkerId, run: &Run) -> Vec<Action> {
+        let (id, actions) = self.deliver(worker, run, 7);
+        assert!(matches!(actions[..], [Action::Store(stored, ..)] if stored == id));
+        self.store(run)
+    }
+
+    fn pass(&mut self, time: Duration) -> Vec<Action> {
+        self.now += time;
+        let actions = self.farm.on_time(self.now);
+        self.farm.check();
+        actions
+    }
+}
+
+fn answers(actions: &[Action]) -> Vec<(AskId, Result<Next, NoMember>)> {
+    let answer = |action: &Action| match action {
+        Action::Answer(ask, answer) => Some((*ask, answer.clone())),
+        _ => None,
+    };
+    actions.iter().filter_map(answer).collect()
+}
+
+fn verdicts(actions: &[Action]) -> Vec<(DeliveryId, Verdict)> {
+    let verdict = |action: &Action| match action {
+        Action::Acknowledge(delivery, verdict) => Some((*delivery, *verdict)),
+        _ => None,
+    };
+    actions.iter().filter_map(verdict).collect()
+}
+
+/// The last state that was published.
+fn shown(actions: &[Action]) -> Progress {
+    let shown = |action: &Action| match action {
+        Action::Publish(_, progress) => Some(progress.clone()),
+        _ => None,
+    };
+    actions.iter().rev().find_map(shown).expect("something is published")
+}
+
+/// The jobs that are forgotten.
+fn forgotten(actions: &[Action]) -> Vec<JobId> {
+    let job = |action: &Action| if let Action::Forget(job) = action { Some(*job) } else { None };
+    actions.iter().filter_map(job).collect()
+}
+
+#[test]
+fn a_call_meant_for_another_incarnation_is_refused_and_counted() {
+    let mut world = World::new();
+    let ours = world.farm.incarnation();
+    assert!(matches!(world.farm.on_call(ours), (Ok(()), actions) if actions.is_empty()));
+    let mut told = Vec::new();
+    for _ in 0..5 {
+        let (admitted, actions) = world.farm.on_call(Incarnation(ours.0 + 1));
+        assert_eq!(admitted, Err(Stranger));
+        told.extend(actions.into_iter().map(|action| match action {
+            Action::Log(Notice::Strangers(count)) => count,
+            other => panic!("{other:?}"),
+        }));
+    }
+    assert_eq!(told, [1, 2, 4], "strangers cannot fill the log");
+}
+
+#[test]
+fn incarnations_number_their_jobs_differently() {
+    let identities = [[1; 24], [2; 24]].map(Identity::from_random);
+    let mut farms = identities.map(|identity| Farm::new(identity, TERM));
+    let numbers: BTreeSet<JobId> =
+        farms.iter_mut().flat_map(|farm| [farm.number_job(), farm.number_job()]).collect();
+    assert_eq!(numbers.len(), 4);
+}
+
+#[test]
+fn a_tile_counts_and_is_acknowledged_when_it_is_stored() {
+    let mut world = World::new();
+    let worker = world.join();
+    world.submit(2);
+    let run = world.lease(worker);
+    let (id, actions) = world.deliver(worker, &run, 7);
+    assert!(matches!(actions[..], [Action::Store(..)]), "{actions:?}");
+    let actions = world.store(&run);
+    assert_eq!(verdicts(&actions), [(id, Verdict::Accepted)]);
+    let progress = shown(&actions);
+    assert_eq!((progress.tiles_done, progress.worker_count, progress.tally.rays), (1, 1, 10));
+    assert_eq!(progress.outcome, None);
+}
+
+#[test]
+fn a_job_is_finished_with_its_last_tile_so_long_after_its_start() {
+    let mut world = World::new();
+    let worker = world.join();
+    world.submit(2);
+    for _ in 0..2 {
+        let run = world.lease(worker);
+        world.now += SECOND;
+        let actions = world.stitch(worker, &run);
+        let progress = shown(&actions);
+        let is_last = progress.tiles_done == 2;
+        assert_eq!(progress.outcome, is_last.then_some(Outcome::Finished(2 * SECOND)));
+    }
+}
+
+#[test]
+fn a_copy_that_comes_while_the_first_is_stored_waits_for_it() {
+    let mut world = World::new();
+    let worker = world.join();
+    world.submit(2);
+    let run = world.lease(worker);
+    let (first, _) = world.deliver(worker, &run, 7);
+    let (copy, actions) = world.deliver(worker, &run, 7);
+    assert!(actions.is_empty(), "{actions:?}");
+    let expected = [(first, Verdict::Accepted), (copy, Verdict::Duplicate)];
+    assert_eq!(verdicts(&world.store(&run)), expected);
+    let (late, actions) = world.deliver(worker, &run, 7);
+    assert_eq!(verdicts(&actions), [(late, Verdict::Duplicate)]);
+}
+
+#[test]
+fn pixels_are_taken_only_from_a_worker_that_was_to_render_them_under_that_lease() {
+    let mut world = World::new();
+    let (worker, other) = (world.join(), world.join());
+    let (job, _) = world.submit(2);
+    let (first, second) = (world.lease(worker), world.lease(worker));
+    let with = |lease, tile: TileId| Run { lease, tiles: vec![tile] };
+    let no_lease = LeaseName { job, id: LeaseId(99) };
+    for (from, run) in [
+        (other, first.clone()),
+        (WorkerId(77), first.clone()),
+        (worker, with(first.lease, second.tiles[0])),
+        (worker, with(no_lease, first.tiles[0])),
+    ] {
+        let (id, actions) = world.deliver(from, &run, 9);
+        assert_eq!(verdicts(&actions), [(id, Verdict::Rejected)], "{from} {run:?}");
+    }
+    // However late, and though the worker is no member any more.
+    world.pass(LONGEST_SILENCE * 2);
+    assert!(!world.farm.members.contains(worker));
+    let actions = world.stitch(worker, &first);
+    assert_eq!(shown(&actions).tiles_done, 1);
+    let mut told = Vec::new();
+    for _ in 0..5 {
+        told.extend(world.deliver(other, &second, 9).1.into_iter().filter_map(
+            |action| match action {
+                Action::Log(Notice::NotGranted { count, .. }) => Some(count),
+                _ => None,
+            },
+        ));
+    }
+    assert_eq!(told, [8], "strangers cannot fill the log");
+}
+
+#[test]
+fn a_picture_that_cannot_be_written_ends_its_job() {
+    let mut world = World::new();
+    let worker = world.join();
+    let (job, _) = world.submit(2);
+    let run = world.lease(worker);
+    let (first, _) = world.deliver(worker, &run, 7);
+    let (copy, _) = world.deliver(worker, &run, 7);
+    let actions = world.farm.on_store_failed(job, "the disk is full".to_owned());
+    let expected = [(first, Verdict::Rejected), (copy, Verdict::Rejected)];
+    assert_eq!(verdicts(&actions), expected);
+    let failed = Outcome::Failed("the disk is full".to_owned());
+    assert_eq!(shown(&actions).outcome, Some(failed));
+    let (late, actions) = world.deliver(worker, &run, 7);
+    assert_eq!(verdicts(&actions), [(late, Verdict::Rejected)]);
+}
+
+#[test]
+fn a_copy_that_differs_is_counted_once_each_time() {
+    let mut world = World::new();
+    let worker = world.join();
+    world.submit(2);
+    let run = world.lease(worker);
+    world.stitch(worker, &run);
+    for count in 1..3 {
+        let (_, actions) = world.deliver(worker, &run, 8);
+        assert_eq!(shown(&actions).differing_tiles, count);
+    }
+}
+
+#[test]
+fn pixels_that_make_no_sense_blame_the_worker_and_the_job_when_two_agree() {
+    let mut world = World::new();
+    let [bad, good, third] = [world.join(), world.join(), world.join()];
+    let (job, _) = world.submit(2);
+    let run = world.lease(bad);
+    let tile = run.tiles[0];
+    // A stranger's say nothing.
+    assert!(world.senseless(good, &run).len() <= 1);
+    let actions = world.senseless(bad, &run);
+    let is_told = |action: &Action| match action {
+        Action::Log(Notice::Suspect { worker, .. }) => *worker == bad,
+        _ => false,
+    };
+    assert!(actions.iter().any(is_told), "{actions:?}");
+    assert!(world.senseless(bad, &run).is_empty(), "a delivery may be repeated");
+    let (ask, actions) = world.ask(bad, 9 * SECOND);
+    assert!(actions.is_empty(), "it gets no more of this job");
+    let other_job = world.submit(1);
+    assert_eq!(answers(&other_job.1)[0].0, ask, "but of another");
+
+    let again = world.lease(good);
+    assert_eq!(again.tiles, [tile]);
+    let actions = world.senseless(good, &again);
+    let reason = format!("workers 1 and 2 rendered tile {}: it is NaN", tile.number());
+    assert_eq!(shown(&actions).outcome, Some(Outcome::Failed(reason)));
+    assert_eq!(world.farm.tile(job, 1), None);
+    let (_, actions) = world.ask(third, Duration::ZERO);
+    assert!(matches!(answers(&actions)[..], [(_, Ok(Next::Nothing))]));
+}
+
+#[test]
+fn a_worker_that_is_alone_gets_a_tile_again_of_which_it_brought_no_sense() {
+    let mut world = World::new();
+    let worker = world.join();
+    world.submit(1);
+    let run = world.lease(worker);
+    assert_eq!(verdicts(&world.senseless(worker, &run)), []);
+    let again = world.lease(worker);
+    assert_eq!(again.tiles, run.tiles);
+    let actions = world.senseless(worker, &again);
+    assert!(matches!(shown(&actions).outcome, Some(Outcome::Failed(_))), "no wait for ever");
+}
+
+#[test]
+fn an_overdue_tile_is_rendered_again_before_a_later_job() {
+    let mut world = World::new();
+    let (stuck, idle) = (world.join(), world.join());
+    let (job, _) = world.submit(3);
+    let first = world.lease(idle);
+    let run = world.lease(stuck);
+    let last = world.lease(idle);
+    // Each takes 0.1 s.
+    world.now += SECOND / 10;
+    world.stitch(idle, &first);
+    world.stitch(idle, &last);
+    let (later, _) = world.submit(9);
+    world.now += Duration::from_millis(550);
+    assert_eq!(world.lease(idle).lease.job, later, "it may still come");
+    world.now += Duration::from_millis(60);
+    let again = world.lease(idle);
+    assert_eq!((again.lease.job, &again.tiles), (job, &run.tiles));
+    assert_eq!(world.lease(idle).lease.job, later, "and only once");
+}
+
+#[test]
+fn a_later_job_starts_when_the_earlier_has_no_free_tile() {
+    let mut world = World::new();
+    let worker = world.join();
+    for job in [world.submit(1).0, world.submit(1).0] {
+        assert_eq!(world.lease(worker).lease.job, job);
+    }
+    let (id, actions) = world.ask(worker, Duration::ZERO);
+    assert_eq!(answers(&actions), [(id, Ok(Next::Nothing))]);
+}
+
+#[test]
+fn those_who_wait_longest_are_served_first() {
+    let mut world = World::new();
+    let workers = [world.join(), world.join(), world.join()];
+    let asks = workers.map(|worker| world.ask(worker, 9 * SECOND).0);
+    let (job, actions) = world.submit(2);
+    let served: Vec<AskId> = answers(&actions).iter().map(|(ask, _)| *ask).collect();
+    assert_eq!(served, asks[..2]);
+    assert!(matches!(&answers(&actions)[0].1, Ok(Next::Render(run)) if run.lease.job == job));
+}
+
+#[test]
+fn a_wait_ends_when_it_is_over() {
+    let mut world = World::new();
+    let worker = world.join();
+    let (ask, actions) = world.ask(worker, 9 * SECOND);
+    assert!(actions.is_empty());
+    assert_eq!(world.farm.next_wake(), Some(world.now + 9 * SECOND));
+    assert!(world.pass(8 * SECOND).is_empty());
+    assert_eq!(answers(&world.pass(SECOND)), [(ask, Ok(Next::Nothing))]);
+}
+
+#[test]
+fn tiles_of_a_lost_lease_go_to_a_worker_that_waits() {
+    for is_told in [true, false] {
+        let mut world = World::new();
+        let (lost, waiting) = (world.join(), world.join());
+        world.submit(1);
+        let run = world.lease(lost);
+        let (ask, actions) = world.ask(waiting, 9 * SECOND);
+        assert!(actions.is_empty());
+        let (actions, why) = if is_told {
+            let why = "killed by signal 9";
+            (world.farm.on_process_exit(1, why, world.now), why)
+        } else {
+            (world.pass(TERM), "no progress for 4.0 s")
+        };
+        let Action::Log(Notice::LeaseLost(loss, reason)) = &actions[0] else {
+            panic!("{actions:?}")
+        };
+        assert_eq!((loss.lease, &loss.tiles, &reason[..]), (run.lease, &run.tiles, why));
+        let [(answered, Ok(Next::Render(again)))] = &answers(&actions)[..] else {
+            panic!("{actions:?}")
+        };
+        assert_eq!((*answered, &again.tiles), (ask, &run.tiles));
+    }
+}
+
+#[test]
+fn a_tile_of_a_quiet_lease_goes_to_another_worker_that_waits() {
+    let mut world = World::new();
+    let (quiet, idle) = (world.join(), world.join());
+    world.submit(1);
+    let (run, start) = (world.lease(quiet), world.now);
+    world.ask(quiet, 9 * SECOND);
+    assert_eq!(world.farm.next_wake(), Some(world.now + TERM), "its own tile is not for it");
+    let (ask, _) = world.ask(idle, 9 * SECOND);
+    let wake = world.farm.next_wake().unwrap();
+    assert!(wake < world.now + TERM);
+    let actions = world.pass(wake - world.now);
+    let [(answered, Ok(Next::Render(again)))] = &answers(&actions)[..] else {
+        panic!("{actions:?}")
+    };
+    assert_eq!((*answered, &again.tiles), (ask, &run.tiles));
+    assert_eq!(world.farm.next_wake(), Some(start + TERM), "and only once");
+}
+
+#[test]
+fn a_silent_worker_is_forgotten_and_told_so() {
+    let mut world = World::new();
+    let worker = world.join();
+    let actions = world.pass(LONGEST_SILENCE);
+    assert!(matches!(actions[..], [Action::Log(Notice::Gone(gone, _))] if gone == worker));
+    let (ask, actions) = world.ask(worker, SECOND);
+    assert_eq!(answers(&actions), [(ask, Err(NoMember(worker)))]);
+    assert_eq!(world.farm.on_renew(worker, &[], world.now), Err(NoMember(worker)));
+}
+
+#[test]
+fn a_worker_that_leaves_waits_no_longer() {
+    let mut world = World::new();
+    let worker = world.join();
+    let (ask, _) = world.ask(worker, SECOND);
+    let actions = world.farm.on_leave(worker, "it was stopped", world.now);
+    assert_eq!(answers(&actions), [(ask, Err(NoMember(worker)))]);
+    assert!(answers(&world.submit(1).1).is_empty());
+}
+
+#[test]
+fn a_second_question_of_a_worker_ends_the_first() {
+    let mut world = World::new();
+    let worker = world.join();
+    let (first, _) = world.ask(worker, SECOND);
+    let (second, actions) = world.ask(worker, SECOND);
+    assert_eq!(answers(&actions), [(first, Ok(Next::Nothing))]);
+    assert_eq!(answers(&world.submit(1).1)[0].0, second);
+}
+
+#[test]
+fn who_hangs_up_gets_no_lease() {
+    let mut world = World::new();
+    let worker = world.join();
+    let (ask, _) = world.ask(worker, SECOND);
+    world.farm.on_hang_up(ask);
+    let (_, actions) = world.submit(1);
+    assert!(answers(&actions).is_empty());
+    assert_eq!(world.lease(worker).lease.id, LeaseId(1), "it is the first");
+}
+
+#[test]
+fn a_cancelled_job_fails_for_those_who_watch_and_is_forgotten() {
+    let mut world = World::new();
+    let worker = world.join();
+    let (job, _) = world.submit(2);
+    let run = world.lease(worker);
+    let (delivery, _) = world.deliver(worker, &run, 7);
+    let actions = world.farm.on_cancel(job);
+    world.farm.check();
+    let reason = Outcome::Failed("it was cancelled".to_owned());
+    assert_eq!(shown(&actions).outcome, Some(reason));
+    assert_eq!(verdicts(&actions), [(delivery, Verdict::Rejected)]);
+    assert_eq!(forgotten(&actions), [job]);
+    assert!(world.store(&run).is_empty(), "nobody wants it any more");
+    assert_eq!(
+        world.farm.on_renew(worker, &[Renewal { lease: run.lease, work: 1 }], world.now),
+        Ok(vec![run.lease])
+    );
+    assert!(world.farm.on_cancel(job).is_empty(), "there is no such job");
+}
+
+#[test]
+fn the_last_jobs_to_end_are_kept() {
+    let mut world = World::new();
+    let worker = world.join();
+    let waiting = world.submit(1).0;
+    let first = world.lease(worker);
+    for _ in 0..KEPT_AFTER_END {
+        world.submit(1);
+        let run = world.lease(worker);
+        assert!(forgotten(&world.stitch(worker, &run)).is_empty());
+    }
+    let actions = world.stitch(worker, &first);
+    assert_eq!(forgotten(&actions), [JobId(waiting.0 + 1)], "the first that ended");
+    assert_eq!(forgotten(&world.farm.on_cancel(waiting)), [waiting], "fetched or not wanted");
+    world.farm.check();
+}
+
+#[test]
+fn a_farm_that_closes_sends_home_who_asks() {
+    let mut world = World::new();
+    let (waiting, busy) = (world.join(), world.join());
+    let (ask, _) = world.ask(waiting, 9 * SECOND);
+    let actions = world.farm.on_close();
+    world.farm.check();
+    assert_eq!(answers(&actions), [(ask, Ok(Next::GoHome))]);
+    let (ask, actions) = world.ask(busy, 9 * SECOND);
+    assert_eq!(answers(&actions), [(ask, Ok(Next::GoHome))]);
+    assert_eq!(actions.len(), 1, "to close is not to stop: {actions:?}");
+}
+
+#[test]
+fn a_farm_that_shuts_down_ends_every_job_and_stops_with_the_last_worker() {
+    for comes in [true, false] {
+        let mut world = World::new();
+        let worker = world.join();
+        let (job, _) = world.submit(2);
+        world.lease(worker);
+        let actions = world.farm.on_shut_down(world.now);
+        world.farm.check();
+        let stopped = Outcome::Failed("the coordinator was stopped".to_owned());
+        assert_eq!(shown(&actions).outcome, Some(stopped.clone()));
+        assert!(!actions.iter().any(|action| matches!(action, Action::Stop)));
+        assert_eq!(world.farm.tile(job, 0), None);
+        let actions = if comes {
+            let (ask, actions) = world.ask(worker, 9 * SECOND);
+            assert_eq!(answers(&actions), [(ask, Ok(Next::GoHome))]);
+            actions
+        } else {
+            assert_eq!(world.farm.next_wake(), Some(world.now + FAREWELL));
+            world.pass(FAREWELL)
+        };
+        assert!(matches!(actions.last(), Some(Action::Stop)), "{actions:?}");
+        assert_eq!(shown(&world.submit(1).1).outcome, Some(stopped), "it comes too late");
+    }
+}
