@@ -457,25 +457,38 @@ fn to_run(run: &Run, job: &Job, is_local: bool) -> wire::Run {
     }
 }
 
-/// Streams a file in pieces; `job` is kept until the last one has gone.
-fn stream_file(mut file: std::fs::File, job: Arc<Job>) -> Chunks {
+/// Streams a file in pieces; `job` is kept until the last one has gone. A thread is taken for as
+/// long as a piece is read: a reader that takes none holds no thread.
+fn stream_file(file: std::fs::File, job: Arc<Job>) -> Chunks {
     let (send, receive) = mpsc::channel(2);
-    tokio::task::spawn_blocking(move || {
-        loop {
-            let mut data = Vec::with_capacity(CHUNK_BYTES);
-            let read = (&mut file).take(CHUNK_BYTES as u64).read_to_end(&mut data);
-            let chunk = match read {
-                Ok(0) => break,
-                Ok(_) => Ok(wire::Chunk { data: data.into() }),
-                Err(error) => Err(broken(&error)),
+    tokio::spawn(async move {
+        let mut rest = Some(file);
+        while let Some(file) = rest.take() {
+            let chunk = match blocking(move || read_chunk(file)).await {
+                Ok(None) => break,
+                Ok(Some((file, chunk))) => {
+                    rest = Some(file);
+                    Ok(chunk)
+                }
+                Err(status) => Err(status),
             };
-            if send.blocking_send(chunk).is_err() {
+            if send.send(chunk).await.is_err() {
                 break;
             }
         }
         drop(job);
     });
     Box::pin(ReceiverStream::new(receive))
+}
+
+/// The next piece of a file, and the file; `None` at its end.
+fn read_chunk(mut file: std::fs::File) -> Result<Option<(std::fs::File, wire::Chunk)>, Status> {
+    let mut data = Vec::with_capacity(CHUNK_BYTES);
+    match (&mut file).take(CHUNK_BYTES as u64).read_to_end(&mut data) {
+        Ok(0) => Ok(None),
+        Ok(_) => Ok(Some((file, wire::Chunk { data: data.into() }))),
+        Err(error) => Err(broken(&error)),
+    }
 }
 
 fn check_version(who: &str, version: &str, protocol: u32, shell: &Shell) -> Result<(), Status> {

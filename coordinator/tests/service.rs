@@ -28,6 +28,7 @@ const VERSION: &str = "1.2.3";
 /// A farm with one worker, played by the test, and one job of 2 x 1 tiles of 8 x 8 pixels.
 struct Farm {
     _folder: TempDir,
+    address: Address,
     tiles: FarmClient<Channel>,
     jobs: JobsClient<Channel>,
     worker: u32,
@@ -66,6 +67,7 @@ impl Farm {
         assert_eq!(accepted.farm, joined.farm);
         Self {
             _folder: folder,
+            address,
             tiles,
             jobs,
             worker,
@@ -294,6 +296,44 @@ async fn a_client_that_goes_while_its_scene_is_prepared_leaves_no_job() {
     };
     let next = farm.tiles.lease(request).await.unwrap().into_inner().next;
     assert!(matches!(next, Some(Next::Nothing(_))), "{next:?}");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn scenes_that_nobody_takes_keep_no_tile_waiting() {
+    let mut farm = Farm::new().await;
+    while farm.state().await.end.is_none() {
+        let (lease, tiles) = farm.lease().await;
+        for tile in tiles {
+            farm.deliver(lease, tile, 0.5).await.unwrap();
+        }
+    }
+    let text = long_scene();
+    let pieces = text.as_bytes().chunks(1 << 20).map(|piece| Part::Text(piece.to_vec().into()));
+    let parts: Vec<_> = std::iter::once(Part::Order(order(VERSION)))
+        .chain(pieces)
+        .map(|part| wire::SubmitRequest { part: Some(part) })
+        .collect();
+    let answer = farm.jobs.submit(tokio_stream::iter(parts)).await.unwrap().into_inner();
+    let Some(Outcome::Accepted(accepted)) = answer.outcome else { panic!("{answer:?}") };
+    farm.job = accepted.job;
+    let (lease, tiles) = farm.lease().await;
+    let request = wire::FetchRequest {
+        scene_hash: farm.scene.0.to_vec().into(),
+        incarnation: farm.incarnation,
+    };
+    // More than there are threads for what blocks, on connections that have room for so many.
+    let mut streams = Vec::new();
+    for _ in 0..6 {
+        let mut client = FarmClient::new(farm.address.connect().await.unwrap());
+        for _ in 0..100 {
+            streams.push(client.fetch(request.clone()).await.unwrap().into_inner());
+        }
+    }
+    tokio::time::sleep(Duration::from_millis(500)).await;
+    let delivering = farm.deliver(lease, tiles[0], 0.5);
+    let delivered = tokio::time::timeout(Duration::from_secs(10), delivering).await;
+    assert_eq!(delivered.expect("an answer"), Ok(wire::Verdict::Accepted));
+    drop(streams);
 }
 
 /// Begins to submit and goes on no further than the order.
