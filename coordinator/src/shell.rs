@@ -310,7 +310,7 @@ impl Shell {
             job = id.0,
             scene = name,
             size = %settings.size,
-            sampling = ?settings.quality.sampling,
+            sampling = %settings.quality.sampling,
             ?transfer,
             tiles = grid.count(),
             side = grid.side(),

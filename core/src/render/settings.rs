@@ -72,6 +72,17 @@ impl Sampling {
     }
 }
 
+impl fmt::Display for Sampling {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Fixed(count) => write!(f, "{count} samples"),
+            Self::Adaptive { error, most } => {
+                write!(f, "error {error:.3e}, at most {most} samples")
+            }
+        }
+    }
+}
+
 /// A number of samples in a pixel: one of [`SampleCount::RANGE`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub struct SampleCount(u32);
