@@ -48,34 +48,36 @@ pub enum PutError {
 #[derive(Debug)]
 pub struct Picture {
     file: File,
-    size: Size,
+    window: Area,
     format: PictureFormat,
     transfer: Transfer,
 }
 
 impl Picture {
-    /// Makes `file`, which must be empty and open for reading and writing, a black picture. As a
-    /// PNG it is encoded by `transfer`.
+    /// Makes `file`, which must be empty and open for reading and writing, a black picture of
+    /// `window`, or of the whole of a frame. As a PNG it is encoded by `transfer`.
     pub fn new(
         file: File,
-        size: Size,
+        window: impl Into<Area>,
         format: PictureFormat,
         transfer: Transfer,
     ) -> io::Result<Self> {
-        file.set_len(Self::byte_count(size, format))?;
-        Ok(Self { file, size, format, transfer })
+        let window = window.into();
+        file.set_len(Self::byte_count(window.size(), format))?;
+        Ok(Self { file, window, format, transfer })
     }
 
     /// Makes a black picture in a file of `folder` that has no name, so that nothing stays behind
     /// however the process ends. Its bytes are reserved: a full disk is an error now, not later.
     pub fn new_in(
         folder: &Path,
-        size: Size,
+        window: impl Into<Area>,
         format: PictureFormat,
         transfer: Transfer,
     ) -> io::Result<Self> {
         let file = tempfile::tempfile_in(folder)?;
-        let byte_count = Self::byte_count(size, format);
+        let window = window.into();
+        let byte_count = Self::byte_count(window.size(), format);
         loop {
             match fallocate(&file, FallocateFlags::empty(), 0, byte_count) {
                 Ok(()) | Err(Errno::OPNOTSUPP) => break,
@@ -83,7 +85,7 @@ impl Picture {
                 Err(error) => return Err(error.into()),
             }
         }
-        Self::new(file, size, format, transfer)
+        Self::new(file, window, format, transfer)
     }
 
     /// Bytes that the file of such a picture takes.
@@ -93,7 +95,7 @@ impl Picture {
 
     /// The picture's size in pixels.
     pub fn size(&self) -> Size {
-        self.size
+        self.window.size()
     }
 
     /// What [`Picture::encode`] writes.
@@ -106,9 +108,9 @@ impl Picture {
         self.transfer
     }
 
-    /// Writes the pixels of `area`, `[y][x]` row by row. It must be an area of a frame of the picture's size.
+    /// Writes the pixels of `area`, `[y][x]` row by row. The picture's window must have them all.
     pub fn put(&self, area: Area, pixels: &[[f32; 3]]) -> Result<(), PutError> {
-        assert_eq!(area.frame(), self.size, "the area is one of the picture's");
+        assert!(self.window.has(area), "the area is one of the picture's");
         check_pixels(area, pixels)?;
         let mut bytes = Vec::with_capacity(area.width() as usize * self.format.bytes_per_pixel());
         for (y, row) in area.rows().zip(pixels.chunks_exact(area.width() as usize)) {
@@ -116,7 +118,8 @@ impl Picture {
             for &pixel in row {
                 self.format.append(&mut bytes, pixel, self.transfer);
             }
-            self.file.write_all_at(&bytes, self.offset(area.x0(), y))?;
+            let offset = self.offset(area.x0() - self.window.x0(), y - self.window.y0());
+            self.file.write_all_at(&bytes, offset)?;
         }
         Ok(())
     }
@@ -140,11 +143,11 @@ impl Picture {
 
     /// Bytes that a row takes.
     pub(crate) fn row_bytes(&self) -> usize {
-        self.size.width() as usize * self.format.bytes_per_pixel()
+        self.window.width() as usize * self.format.bytes_per_pixel()
     }
 
     fn offset(&self, x: u32, y: u32) -> u64 {
-        let pixels = u64::from(y) * u64::from(self.size.width()) + u64::from(x);
+        let pixels = u64::from(y) * u64::from(self.window.width()) + u64::from(x);
         pixels * self.format.bytes_per_pixel() as u64
     }
 }
