@@ -1,6 +1,8 @@
 //! The whole farm as processes: the same bytes whoever renders them and whatever befalls them,
 //! logs that count, nothing left behind.
 
+mod faults;
+
 use std::{
     collections::BTreeSet,
     fs::{self, File},
@@ -100,7 +102,14 @@ impl Place {
 
     /// Starts the program; what it says to standard error goes to the file `log`.
     fn start(&self, log: &str, args: &[&str]) -> Process {
-        let mut child = Command::new(env!("CARGO_BIN_EXE_rtfarm"))
+        self.start_by(&[], log, args)
+    }
+
+    /// Starts it by a command that becomes it.
+    fn start_by(&self, starter: &[String], log: &str, args: &[&str]) -> Process {
+        let mut words = starter.iter().map(String::as_str).chain([env!("CARGO_BIN_EXE_rtfarm")]);
+        let mut child = Command::new(words.next().expect("the program's own name"))
+            .args(words)
             .args(args)
             .current_dir(self.folder.path())
             .env("TMPDIR", self.path("tmp"))
@@ -603,12 +612,12 @@ fn start_coordinator(place: &Place) -> (Process, String) {
     (coordinator, url)
 }
 
-/// Does `check` with a small disk at `disk` in the place; the disk is unmounted by the end.
-fn with_small_disk(place: &Place, check: impl FnOnce() + std::panic::UnwindSafe) {
+/// Does `check` with a disk of that size at `disk` in the place; the disk is unmounted by the end.
+fn with_small_disk(place: &Place, size: &str, check: impl FnOnce()) {
     let disk = place.path("disk");
     fs::create_dir(&disk).unwrap();
     let mounted = Command::new("mount")
-        .args(["-t", "tmpfs", "-o", "size=64k", "none"])
+        .args(["-t", "tmpfs", "-o", &format!("size={size}"), "none"])
         .arg(&disk)
         .output()
         .is_ok_and(|output| output.status.success());
@@ -616,7 +625,7 @@ fn with_small_disk(place: &Place, check: impl FnOnce() + std::panic::UnwindSafe)
         eprintln!("SKIPPED: only root can mount the small disk that this test fills");
         return;
     }
-    let checked = std::panic::catch_unwind(check);
+    let checked = std::panic::catch_unwind(std::panic::AssertUnwindSafe(check));
     assert!(Command::new("umount").arg(&disk).status().unwrap().success());
     checked.unwrap();
 }
@@ -624,7 +633,7 @@ fn with_small_disk(place: &Place, check: impl FnOnce() + std::panic::UnwindSafe)
 #[test]
 fn a_full_disk_is_told_at_once() {
     let place = Place::new();
-    with_small_disk(&place, || {
+    with_small_disk(&place, "64k", || {
         for workers in ["0", "2"] {
             let size = ["--size", "512x512", "--samples", "1", "--workers", workers];
             let args = [&["render", "scene.rt", "-o", "disk/out.png"], &size[..]].concat();
@@ -641,7 +650,7 @@ fn a_picture_for_which_there_is_no_room_is_fetched_again() {
     let (_coordinator, url) = start_coordinator(&place);
     let _worker = place.start("worker.log", &["worker", "--threads", "1", "--coordinator", &url]);
     let picture = ["--size", "256x256", "--samples", "1"];
-    with_small_disk(&place, || {
+    with_small_disk(&place, "64k", || {
         let args = ["submit", "scene.rt", "-o", "disk/out.exr", "--coordinator", &url];
         let mut submit = place.start("submit.log", &[&args[..], &picture].concat());
         assert_eq!(submit.wait().code(), Some(1));
