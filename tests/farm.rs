@@ -252,6 +252,25 @@ fn pictures_do_not_depend_on_workers_threads_and_tiles() {
 }
 
 #[test]
+fn a_crop_window_shows_those_pixels_of_the_whole_picture() {
+    let place = Place::new();
+    let decode = |bytes: &[u8]| image::load_from_memory(bytes).unwrap().into_rgb16();
+    let common = ["--size", "101x67", "--depth", "16", "--error", "0.02", "--workers"];
+    let whole = decode(&place.render("out.png", &[&common[..], &["2"]].concat()));
+    for (crop, [x, y, width, height]) in
+        [("17,5,40,33", [17, 5, 40, 33]), ("100,66,1,1", [100, 66, 1, 1])]
+    {
+        let expected = image::imageops::crop_imm(&whole, x, y, width, height).to_image();
+        for workers in ["0", "2"] {
+            let args = [&common[..], &[workers, "--tile", "16", "--crop", crop]].concat();
+            let found = decode(&place.render("out.png", &args));
+            assert!(found == expected, "{crop} with {workers} workers");
+        }
+    }
+    place.check_nothing_is_left();
+}
+
+#[test]
 fn a_picture_in_a_given_time_can_be_had_again() {
     let place = Place::new();
     let common = ["--size", "64x48", "--workers", "0", "--threads", "1"];
@@ -346,7 +365,16 @@ fn a_farm_over_tcp_gives_the_same_bytes() {
     let mut workers = [place.start("worker-a.log", &worker), place.start("worker-b.log", &worker)];
     for output in ["farm.png", "farm.exr"] {
         let pictures = ["none", "srgb"].map(|transfer| {
-            let picture = ["--size", "103x59", "--samples", "2", "--transfer", transfer];
+            let picture = [
+                "--size",
+                "103x59",
+                "--crop",
+                "3,5,99,50",
+                "--samples",
+                "2",
+                "--transfer",
+                transfer,
+            ];
             let args = [&["submit", "scene.rt", "-o", output, "--coordinator", url], &picture[..]];
             let mut submit = place.start("submit.log", &args.concat());
             assert!(submit.wait().success(), "{}", submit.log());
@@ -526,6 +554,8 @@ fn bad_input_gives_one_clear_line_and_an_exit_code() {
         ("scene.rt", "o.png", "--size=0x0", 2, "not 0x0"),
         ("scene.rt", "o.png", "--size=100000x100000", 2, "not 100000x100000"),
         ("scene.rt", "o.png", "--size=1e3x5", 2, "a size looks like 1280x720"),
+        ("scene.rt", "o.png", "--crop=1,2,3", 2, "a crop window looks like 320,180,640,360"),
+        ("scene.rt", "o.png", "--crop=0,0,9999,1", 2, "does not have all of the crop window"),
         ("scene.rt", "o.png", "--tile=2", 2, "2 is not in 4..=1024"),
         ("scene.rt", "o.png", "--samples=0", 2, "must be a whole number from 1 to 65536"),
         ("scene.rt", "o.png", "--error=0", 2, "must be a number above 0 and at most 1"),

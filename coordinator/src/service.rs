@@ -12,7 +12,7 @@ use std::{
 use rtfarm_core::{
     language::{Style, draw_diagnostics},
     render::Tally,
-    tile::Size,
+    tile::{Crop, Size},
 };
 use rtfarm_job::{Outcome, Placed, Progress, Refusal, RenderRequest};
 use rtfarm_picture::check_pixels;
@@ -241,7 +241,7 @@ impl jobs_server::Jobs for JobsService {
             let outcome = match job {
                 Ok(job) => submit_response::Outcome::Accepted(wire::Accepted {
                     job: job.id.0,
-                    frame: Some(job.settings.size.into()),
+                    frame: Some(job.grid.window().size().into()),
                     tile_count: job.grid.count(),
                     farm: identity.farm.0.to_vec().into(),
                     incarnation: identity.incarnation.0,
@@ -419,9 +419,10 @@ fn to_request(order: wire::Order) -> Result<RenderRequest, WireError> {
     let size = order.frame.map(Size::try_from).transpose()?;
     let transfer = transfer(order.transfer)?;
     let quality = order.quality.ok_or(WireError::Missing("quality"))?.try_into()?;
-    let wire::Order { name, strict, tile_side, .. } = order;
+    let wire::Order { name, strict, tile_side, crop, .. } = order;
     let tile_side = (tile_side > 0).then_some(tile_side.into());
-    Ok(RenderRequest { name, strict, size, quality, tile_side, transfer, format })
+    let crop = crop.map(Into::into);
+    Ok(RenderRequest { name, strict, size, crop, quality, tile_side, transfer, format })
 }
 
 fn to_event(progress: &Progress) -> wire::Event {
@@ -449,6 +450,7 @@ fn to_run(run: &Run, job: &Job, is_local: bool) -> wire::Run {
         scene_path: path.unwrap_or_default().to_owned(),
         settings: Some(job.settings.into()),
         tile_side: job.grid.side(),
+        window: Some(Crop::from(job.grid.window()).into()),
     };
     wire::Run {
         lease: Some(run.lease.into()),

@@ -302,14 +302,14 @@ impl Shell {
         let scene = SceneFile::write(scene_folder, &prepared)
             .map_err(|error| SubmitError::Scene(scene_folder.clone(), error))?;
         drop(prepared);
-        let picture = Picture::new_in(picture_folder, settings.size, format, transfer)
+        let picture = Picture::new_in(picture_folder, grid.window(), format, transfer)
             .map_err(|error| SubmitError::Picture(picture_folder.clone(), error))?;
 
         let id = self.state().farm.number_job();
         tracing::info!(
             job = id.0,
             scene = name,
-            size = %settings.size,
+            size = %grid.window().size(),
             sampling = %settings.quality.sampling,
             ?transfer,
             tiles = grid.count(),
@@ -319,7 +319,7 @@ impl Shell {
         );
         let progress =
             watch::Sender::new(Progress { tile_count: grid.count(), ..Progress::default() });
-        let hasher = TileHasher::new(id, scene.hash(), settings, grid.side());
+        let hasher = TileHasher::new(id, scene.hash(), settings, grid);
         let job = Arc::new(Job { id, scene, settings, grid, hasher, picture, progress });
         // Not under the lock: there may be a million.
         let tiles = Tiles::new(grid);

@@ -111,7 +111,7 @@ impl Farm {
     fn hash(&self, tile: u32, pixels: &[u8]) -> Vec<u8> {
         let grid = TileGrid::new(self.settings.size, 8).unwrap();
         let tile = grid.tile(tile).or(grid.tile(0)).unwrap();
-        let hasher = TileHasher::new(JobId(self.job), self.scene, self.settings, 8);
+        let hasher = TileHasher::new(JobId(self.job), self.scene, self.settings, grid);
         hasher.hash(tile, pixels).to_vec()
     }
 

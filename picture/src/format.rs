@@ -25,18 +25,22 @@ impl PictureFormat {
         }
     }
 
-    /// Appends pixels, which come as little-endian f32, as the picture's file holds them.
-    pub(crate) fn append(self, bytes: &mut Vec<u8>, pixels: &[u8], transfer: Transfer) {
+    /// Pixels, which come as little-endian f32, as the picture's file holds them.
+    pub(crate) fn encode(self, pixels: &[u8], transfer: Transfer) -> Vec<u8> {
         let (pixels, _) = pixels.as_chunks::<PIXEL_BYTES>();
-        let light = pixels.iter().flat_map(channels);
-        match self {
-            Self::Png8 => bytes.extend(light.map(|light| quantize(light, transfer, 255.0) as u8)),
-            // PNG has the high byte first.
-            Self::Png16 => bytes.extend(
-                light.flat_map(|light| (quantize(light, transfer, 65_535.0) as u16).to_be_bytes()),
-            ),
-            Self::ExrF32 => bytes.extend(light.flat_map(f32::to_ne_bytes)),
+        let mut bytes = Vec::with_capacity(pixels.len() * self.bytes_per_pixel());
+        for light in pixels.iter().flat_map(channels) {
+            match self {
+                Self::Png8 => bytes.push(quantize(light, transfer, 255.0) as u8),
+                // PNG has the high byte first.
+                Self::Png16 => {
+                    let step = quantize(light, transfer, 65_535.0) as u16;
+                    bytes.extend(step.to_be_bytes());
+                }
+                Self::ExrF32 => bytes.extend(light.to_ne_bytes()),
+            }
         }
+        bytes
     }
 }
 

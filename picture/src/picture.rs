@@ -60,34 +60,36 @@ pub(crate) const PIXEL_BYTES: usize = 12;
 #[derive(Debug)]
 pub struct Picture {
     file: File,
-    size: Size,
+    window: Area,
     format: PictureFormat,
     transfer: Transfer,
 }
 
 impl Picture {
-    /// Makes `file`, which must be empty and open for reading and writing, a black picture. As a
-    /// PNG it is encoded by `transfer`.
+    /// Makes `file`, which must be empty and open for reading and writing, a black picture of
+    /// `window`, or of the whole of a frame. As a PNG it is encoded by `transfer`.
     pub fn new(
         file: File,
-        size: Size,
+        window: impl Into<Area>,
         format: PictureFormat,
         transfer: Transfer,
     ) -> io::Result<Self> {
-        file.set_len(Self::byte_count(size, format))?;
-        Ok(Self { file, size, format, transfer })
+        let window = window.into();
+        file.set_len(Self::byte_count(window.size(), format))?;
+        Ok(Self { file, window, format, transfer })
     }
 
     /// Makes a black picture in a file of `folder` that has no name, so that nothing stays behind
     /// however the process ends. Its bytes are reserved: a full disk is an error now, not later.
     pub fn new_in(
         folder: &Path,
-        size: Size,
+        window: impl Into<Area>,
         format: PictureFormat,
         transfer: Transfer,
     ) -> io::Result<Self> {
         let file = tempfile::tempfile_in(folder)?;
-        let byte_count = Self::byte_count(size, format);
+        let window = window.into();
+        let byte_count = Self::byte_count(window.size(), format);
         loop {
             match fallocate(&file, FallocateFlags::empty(), 0, byte_count) {
                 Ok(()) | Err(Errno::OPNOTSUPP) => break,
@@ -95,7 +97,7 @@ impl Picture {
                 Err(error) => return Err(error.into()),
             }
         }
-        Self::new(file, size, format, transfer)
+        Self::new(file, window, format, transfer)
     }
 
     /// Bytes that the file of such a picture takes.
@@ -105,7 +107,7 @@ impl Picture {
 
     /// The picture's size in pixels.
     pub fn size(&self) -> Size {
-        self.size
+        self.window.size()
     }
 
     /// What [`Picture::encode`] writes.
@@ -118,48 +120,47 @@ impl Picture {
         self.transfer
     }
 
-    /// Writes the pixels of `area`, `[y][x]` row by row. It must be an area of a frame of the picture's size.
+    /// Writes the pixels of `area`, `[y][x]` row by row. The picture's window must have them all.
     pub fn put(&self, area: Area, pixels: &[[f32; 3]]) -> Result<(), PutError> {
         self.put_all(&[TilePixels { area, bytes: pixel_bytes(pixels) }])
     }
 
-    /// Writes tiles, which must be areas of a frame of the picture's size. Tiles that stand side by
-    /// side are written together, a row at a time, or all rows at once when they are as wide as the
-    /// picture.
+    /// Writes tiles, all of which the picture's window must have. Those that stand side by side are
+    /// written together, a row at a time, or all rows at once when they are as wide as the picture.
     pub fn put_all(&self, tiles: &[TilePixels<'_>]) -> Result<(), PutError> {
-        for tile in tiles {
-            assert_eq!(tile.area.frame(), self.size, "the area is one of the picture's");
-            tile.check()?;
-        }
-        let mut tiles = tiles.to_vec();
-        tiles.sort_unstable_by_key(|tile| (tile.area.rows().start, tile.area.x0()));
-        let is_beside = |left: &TilePixels<'_>, right: &TilePixels<'_>| {
-            left.area.rows() == right.area.rows() && left.area.columns().end == right.area.x0()
+        let encoded = tiles.iter().map(|tile| Ok((tile.area, self.encode_tile(tile)?)));
+        Ok(self.write(encoded.collect::<Result<_, PutError>>()?)?)
+    }
+
+    /// The bytes of a tile, row by row, as the picture's file holds them.
+    fn encode_tile(&self, tile: &TilePixels<'_>) -> Result<Vec<u8>, PutError> {
+        assert!(self.window.has(tile.area), "the area is one of the picture's");
+        tile.check()?;
+        Ok(self.format.encode(tile.bytes, self.transfer))
+    }
+
+    /// Writes tiles as the picture's file holds them.
+    fn write(&self, mut tiles: Vec<(Area, Vec<u8>)>) -> io::Result<()> {
+        tiles.sort_unstable_by_key(|(area, _)| (area.rows().start, area.x0()));
+        let is_beside = |(left, _): &(Area, _), (right, _): &(Area, _)| {
+            left.rows() == right.rows() && left.columns().end == right.x0()
         };
         let mut bytes = Vec::new();
         for side_by_side in tiles.chunk_by(is_beside) {
-            self.put_side_by_side(side_by_side, &mut bytes)?;
-        }
-        Ok(())
-    }
-
-    /// Writes tiles of the same rows, each beginning where the one before ends. `bytes` is room for
-    /// what is written.
-    fn put_side_by_side(&self, tiles: &[TilePixels<'_>], bytes: &mut Vec<u8>) -> io::Result<()> {
-        let (x0, rows) = (tiles[0].area.x0(), tiles[0].area.rows());
-        bytes.clear();
-        for y in 0..rows.len() {
-            for tile in tiles {
-                let row_bytes = tile.area.width() as usize * PIXEL_BYTES;
-                self.format.append(bytes, &tile.bytes[y * row_bytes..][..row_bytes], self.transfer);
+            let (x0, rows) = (side_by_side[0].0.x0(), side_by_side[0].0.rows());
+            bytes.clear();
+            for y in 0..rows.len() {
+                for (_, tile) in side_by_side {
+                    let row_bytes = tile.len() / rows.len();
+                    bytes.extend_from_slice(&tile[y * row_bytes..][..row_bytes]);
+                }
             }
-        }
-        let row_bytes = bytes.len() / rows.len();
-        if row_bytes == self.row_bytes() {
-            return self.file.write_all_at(bytes, self.offset(0, rows.start));
-        }
-        for (y, row) in rows.zip(bytes.chunks_exact(row_bytes)) {
-            self.file.write_all_at(row, self.offset(x0, y))?;
+            let row_bytes = bytes.len() / rows.len();
+            let at_once = if row_bytes == self.row_bytes() { bytes.len() } else { row_bytes };
+            for (y, run) in rows.zip(bytes.chunks_exact(at_once)) {
+                let offset = self.offset(x0 - self.window.x0(), y - self.window.y0());
+                self.file.write_all_at(run, offset)?;
+            }
         }
         Ok(())
     }
@@ -183,11 +184,11 @@ impl Picture {
 
     /// Bytes that a row takes.
     pub(crate) fn row_bytes(&self) -> usize {
-        self.size.width() as usize * self.format.bytes_per_pixel()
+        self.window.width() as usize * self.format.bytes_per_pixel()
     }
 
     fn offset(&self, x: u32, y: u32) -> u64 {
-        let pixels = u64::from(y) * u64::from(self.size.width()) + u64::from(x);
+        let pixels = u64::from(y) * u64::from(self.window.width()) + u64::from(x);
         pixels * self.format.bytes_per_pixel() as u64
     }
 }

@@ -4,7 +4,7 @@ use prost::bytes::Bytes;
 use rtfarm_core::{
     prepared::SceneHash,
     render::{Cutoff, Quality, SampleLimit, Sampling, Settings, StandardError, Tally},
-    tile::{Size, SizeError},
+    tile::{Crop, CropError, Size, SizeError},
     transfer::Transfer,
 };
 use rtfarm_picture::PictureFormat;
@@ -41,6 +41,9 @@ pub enum WireError {
     /// The frame is none.
     #[error(transparent)]
     Size(#[from] SizeError),
+    /// The frame does not have the window.
+    #[error(transparent)]
+    Crop(#[from] CropError),
 }
 
 impl TryFrom<wire::Frame> for Size {
@@ -54,6 +57,18 @@ impl TryFrom<wire::Frame> for Size {
 impl From<Size> for wire::Frame {
     fn from(size: Size) -> Self {
         Self { width: size.width(), height: size.height() }
+    }
+}
+
+impl From<wire::Crop> for Crop {
+    fn from(wire::Crop { x, y, width, height }: wire::Crop) -> Self {
+        Self { corner: [x, y], sides: [width, height] }
+    }
+}
+
+impl From<Crop> for wire::Crop {
+    fn from(Crop { corner: [x, y], sides: [width, height] }: Crop) -> Self {
+        Self { x, y, width, height }
     }
 }
 

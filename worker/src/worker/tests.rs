@@ -40,7 +40,7 @@ fn job(scene: u8) -> Arc<Job> {
         scene_path: None,
         settings,
         grid: grid(),
-        hasher: TileHasher::new(JobId(1), SceneHash([scene; 32]), settings, 16),
+        hasher: TileHasher::new(JobId(1), SceneHash([scene; 32]), settings, grid()),
     })
 }
 
