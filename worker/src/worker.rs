@@ -17,6 +17,7 @@ use crate::{
     config::Config,
     error::WorkerError,
     job::Job,
+    pulse::Object,
     scene::SceneError,
     task::{Action, GivenUp, TaskId, Tasks},
 };
@@ -91,10 +92,12 @@ struct Member {
 struct Held {
     /// Tiles that are not on their way to the coordinator yet: at least one.
     tiles_left: usize,
-    /// Signs of progress under it.
+    /// Steps that brought its scene.
     work: u64,
-    /// Those of them that the coordinator was told of.
-    told: u64,
+    /// Tiles of those left that were begun, and the steps that were made for each.
+    begun: BTreeMap<TileId, u64>,
+    /// There were steps of which the coordinator was not told yet.
+    has_news: bool,
 }
 
 #[derive(Debug)]
@@ -210,12 +213,14 @@ impl Worker {
         }
     }
 
-    /// Event: threads or a fetch have made so much progress under leases since the last time.
-    pub(crate) fn on_beat(&mut self, beats: &BTreeMap<LeaseName, u64>, now: Instant) {
+    /// Event: threads or a fetch have made so many steps since the last time.
+    pub(crate) fn on_beat(&mut self, beats: &BTreeMap<Object, u64>, now: Instant) {
         if let Stage::Working(member) = &mut self.stage {
-            for (lease, count) in beats {
-                if let Some(held) = member.leases.get_mut(lease) {
-                    held.work += count;
+            for (&(lease, tile), count) in beats {
+                if let Some(held) = member.leases.get_mut(&lease) {
+                    *tile.map_or(&mut held.work, |tile| held.begun.entry(tile).or_default()) +=
+                        count;
+                    held.has_news = true;
                 }
             }
             self.proceed(now);
@@ -339,7 +344,8 @@ impl Member {
         if run.tiles.is_empty() {
             return;
         }
-        let held = Held { tiles_left: run.tiles.len(), work: 0, told: 0 };
+        let (tiles_left, begun) = (run.tiles.len(), BTreeMap::new());
+        let held = Held { tiles_left, work: 0, begun, has_news: false };
         self.leases.insert(run.lease, held);
         if self.scenes.contains(&run.job.scene) {
             self.queue(run);
@@ -380,7 +386,7 @@ impl Member {
         while self.delivering_count < TILES_AHEAD * self.threads
             && let Some(tile) = self.rendered.pop_front()
         {
-            self.on_tile_sent(tile.lease);
+            self.on_tile_sent(tile.lease, tile.tile);
             self.delivering_count += 1;
             tasks.call(Call::Deliver { member: self.id, tile }, now);
         }
@@ -402,12 +408,13 @@ impl Member {
             let most_tiles = LONGEST_RUN_A_THREAD * self.threads;
             tasks.call(Call::Lease { member: self.id, most_tiles, wait: LONGEST_WAIT }, now);
         }
-        let has_news = self.leases.values().any(|held| held.work > held.told);
+        let has_news = self.leases.values().any(|held| held.has_news);
         if has_news && !self.is_renewing {
             self.is_renewing = true;
             let renewals = self.leases.iter_mut().map(|(&lease, held)| {
-                held.told = held.work;
-                Renewal { lease, work: held.work }
+                held.has_news = false;
+                let tiles = held.begun.iter().map(|(tile, &work)| (tile.number(), work));
+                Renewal { lease, work: held.work, tiles: tiles.collect() }
             });
             let renewals = renewals.collect();
             tasks.call(Call::Renew { member: self.id, renewals }, now);
@@ -424,9 +431,10 @@ impl Member {
             && pixels < MOST_TILES_OF_PIXELS * self.threads
     }
 
-    fn on_tile_sent(&mut self, name: LeaseName) {
+    fn on_tile_sent(&mut self, name: LeaseName, tile: TileId) {
         if let Some(held) = self.leases.get_mut(&name) {
             held.tiles_left -= 1;
+            held.begun.remove(&tile);
             if held.tiles_left == 0 {
                 self.leases.remove(&name);
             }
