@@ -228,3 +228,40 @@ impl Audit {
         assert!(self.checks.keys().all(|&(job, _)| is_rendered(job)));
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use rtfarm_core::tile::{Size, TileGrid};
+
+    use super::*;
+
+    #[test]
+    fn of_liars_in_five_percent_of_10000_tiles_99_percent_are_caught() {
+        const SEEDS: u64 = 5000;
+        let grid = TileGrid::new(Size::new(1600, 1600).unwrap(), 16).unwrap();
+        let is_caught = |seed: &u64| {
+            let audit =
+                Audit::new(0.01, std::array::from_fn(|index| seed.to_le_bytes()[index % 8]));
+            // One in twenty of all tiles; which is all the same, since lots are drawn for each.
+            let lies = (0..10_000).step_by(20).map(|number| grid.tile(number).unwrap());
+            lies.into_iter().any(|tile| audit.chooses(JobId(1), tile, WorkerId(1), false))
+        };
+        let caught = (0..SEEDS).filter(is_caught).count() as f64 / SEEDS as f64;
+        eprintln!("{caught}");
+        // 1 - 0.99^500.
+        assert!((0.990..0.997).contains(&caught), "{caught}");
+    }
+
+    #[test]
+    fn one_percent_is_compared_and_the_first_of_each_worker_or_nothing() {
+        let grid = TileGrid::new(Size::new(16_000, 1600).unwrap(), 16).unwrap();
+        let tiles = || (0..grid.count()).map(|number| grid.tile(number).unwrap());
+        let [some, none] = [0.01, 0.0].map(|fraction| Audit::new(fraction, [3; 32]));
+        let chosen = |audit: &Audit, first| {
+            tiles().filter(|&tile| audit.chooses(JobId(1), tile, WorkerId(1), first)).count()
+        };
+        assert!((900..1100).contains(&chosen(&some, false)), "{}", chosen(&some, false));
+        assert_eq!(chosen(&some, true), 100_000);
+        assert_eq!((chosen(&none, false), chosen(&none, true)), (0, 0));
+    }
+}

@@ -24,6 +24,8 @@ mod service;
 mod shell;
 #[cfg(test)]
 mod simulation;
+#[cfg(test)]
+mod steady;
 mod store;
 mod tiles;
 mod waiting;
