@@ -223,6 +223,11 @@ pub(crate) struct CoordinatorArgs {
     #[arg(long, value_name = "S", default_value = "4", value_parser = parse_seconds)]
     pub(crate) lease_seconds: Duration,
 
+    /// How much of what a worker renders another renders again, to find out who lies, from 0 to 1;
+    /// besides, each worker's first tile of a picture. 0 compares nothing.
+    #[arg(long, value_name = "FRACTION", default_value = "0.01", value_parser = parse_fraction)]
+    pub(crate) audit: f64,
+
     /// How log lines are written.
     #[arg(long, value_name = "FORMAT", default_value = "text")]
     pub(crate) log_format: LogFormat,
@@ -455,6 +460,11 @@ fn parse_seconds(text: &str) -> Result<Duration, String> {
     } else {
         Err("a time is from 0.1 to 86400 seconds".to_owned())
     }
+}
+
+fn parse_fraction(text: &str) -> Result<f64, &'static str> {
+    let fraction = text.parse().ok().filter(|fraction| (0.0..=1.0).contains(fraction));
+    fraction.ok_or("a fraction is a number from 0 to 1")
 }
 
 #[cfg(test)]

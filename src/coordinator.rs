@@ -41,6 +41,7 @@ pub(crate) async fn run(
     let coordinator = Coordinator::new(Config {
         version: VERSION.to_owned(),
         term: args.lease_seconds,
+        audit: args.audit,
         upload_silence: UPLOAD_SILENCE,
         scene_folder: folder.path().to_owned(),
         picture_folder: folder.path().to_owned(),

@@ -46,9 +46,10 @@ impl Job {
 
 /// Replaces an older state of a job; says whether it was older.
 fn replace_older(shown: &mut Progress, progress: Progress) -> bool {
-    // Each of these only grows, and one of them does with every change.
+    // One of these grows with every change, and none before it shrinks.
     let age = |progress: &Progress| {
-        (progress.outcome.is_some(), progress.tiles_done, progress.differing_tiles)
+        let Progress { tiles_done, differing_tiles, taken_back, outcome, .. } = progress;
+        (outcome.is_some(), *taken_back, *tiles_done, *differing_tiles)
     };
     let is_older = age(shown) < age(&progress);
     if is_older {
@@ -72,5 +73,8 @@ mod tests {
         assert!(replace_older(&mut shown, state(3, Some(Outcome::Failed(String::new())))));
         assert!(!replace_older(&mut shown, state(4, None)), "the end is the last to be shown");
         assert_eq!(shown.tiles_done, 3);
+        let mut shown = state(3, None);
+        assert!(replace_older(&mut shown, Progress { taken_back: 2, ..state(1, None) }));
+        assert!(!replace_older(&mut shown, state(3, None)), "tiles were taken back since");
     }
 }

@@ -7,21 +7,25 @@
 //! knows only what stands before it:
 //!
 //! ```text
-//! identity, tiles <- lease, members, waiting <- farm, store, job <- shell <- service <- run
+//! identity, tiles, pace <- lease, members, waiting, audit <- farm, store, job <- shell <- service <- run
 //! accept <- run
 //! ```
 
 mod accept;
+mod audit;
 mod farm;
 mod identity;
 mod job;
 mod lease;
 mod members;
+mod pace;
 mod run;
 mod service;
 mod shell;
 #[cfg(test)]
 mod simulation;
+#[cfg(test)]
+mod steady;
 mod store;
 mod tiles;
 mod waiting;

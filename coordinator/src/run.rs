@@ -47,9 +47,12 @@ const CLOSING: Duration = Duration::from_millis(1500);
 impl Coordinator {
     /// Makes a coordinator without jobs and workers, and draws its identity.
     pub fn new(config: Config) -> io::Result<Self> {
-        let mut random = [0; 24];
-        rustix::rand::getrandom(&mut random, rustix::rand::GetRandomFlags::empty())?;
-        Ok(Self { shell: Arc::new(Shell::new(config, Identity::from_random(random))) })
+        let (mut random, mut secret) = ([0; 24], [0; 32]);
+        for bytes in [&mut random[..], &mut secret] {
+            rustix::rand::getrandom(bytes, rustix::rand::GetRandomFlags::empty())?;
+        }
+        let identity = Identity::from_random(random);
+        Ok(Self { shell: Arc::new(Shell::new(config, identity, secret)) })
     }
 
     /// Takes an order. This writes files: never call it on the async runtime.

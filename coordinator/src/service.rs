@@ -86,6 +86,7 @@ impl farm_server::Farm for FarmService {
         check_version("worker", &version, protocol, &self.shell)?;
         let threads = threads as usize;
         let worker = self.shell.join(Process { nonce, number: process, threads, host, isa });
+        let worker = worker.map_err(|error| Status::failed_precondition(error.to_string()))?;
         let term_ms = u32::try_from(self.shell.config.term.as_millis()).unwrap_or(u32::MAX);
         Ok(Response::new(wire::JoinResponse {
             worker: worker.0,

@@ -18,10 +18,11 @@ use tokio::sync::{Notify, oneshot, watch};
 use tokio_util::sync::CancellationToken;
 
 use crate::{
+    audit::Audit,
     farm::{Action, Delivery, DeliveryId, Farm, Next, Notice, Verdict},
     identity::{Identity, Stranger},
     job::Job,
-    members::{NoMember, Process},
+    members::{KeptOut, NoMember, Process},
     store::SceneFile,
     tiles::Tiles,
     waiting::{Ask, AskId},
@@ -34,6 +35,9 @@ pub struct Config {
     pub version: String,
     /// How long a lease lives without progress.
     pub term: Duration,
+    /// Of the tiles, from 0 to 1, that another worker renders again, to compare; besides those each
+    /// worker's first of a job, unless this is 0.
+    pub audit: f64,
     /// A client that sends nothing of its scene for this long is given up.
     pub upload_silence: Duration,
     /// For prepared scenes: a folder that is nobody else's.
@@ -119,9 +123,11 @@ impl Works {
 
 impl Shell {
     /// Makes a farm without jobs and workers.
-    pub(crate) fn new(config: Config, identity: Identity) -> Self {
+    /// `secret` chooses the tiles that are compared.
+    pub(crate) fn new(config: Config, identity: Identity, secret: [u8; 32]) -> Self {
+        let audit = Audit::new(config.audit, secret);
         let state = State {
-            farm: Farm::new(identity, config.term),
+            farm: Farm::new(identity, config.term, audit),
             jobs: BTreeMap::new(),
             asks: HashMap::new(),
             batches: BTreeMap::new(),
@@ -250,7 +256,7 @@ impl Shell {
         self.tell(|state, _| state.farm.on_call(Incarnation(incarnation)))
     }
 
-    pub(crate) fn join(&self, process: Process) -> WorkerId {
+    pub(crate) fn join(&self, process: Process) -> Result<WorkerId, KeptOut> {
         self.tell(|state, now| state.farm.on_join(process, now))
     }
 
@@ -447,6 +453,11 @@ fn log(notice: Notice) {
             lease = loss.lease.id.0,
             "lease lost"
         ),
+        Notice::SetAside(job, tile) => tracing::error!(
+            job = job.0,
+            tile = tile.number(),
+            "a tile is set aside: too many workers were lost with it, or stood still"
+        ),
         Notice::TileDone { delivery, progress, elapsed } => {
             let Delivery { worker, tile, seconds, tally, .. } = delivery;
             let (worker, rays) = (Some(worker.0), tally.rays);
@@ -455,10 +466,26 @@ fn log(notice: Notice) {
         Notice::CopiesDiffer { second, first } => tracing::error!(
             worker = second.worker.0,
             tile = second.tile.number(),
-            first = %blake3::Hash::from_bytes(first),
+            other = first.worker.0,
+            first = %blake3::Hash::from_bytes(first.hash),
             second = %blake3::Hash::from_bytes(second.hash),
             "two copies of a tile differ; one of their workers is broken"
         ),
+        Notice::Liar { worker, job, tile } => tracing::error!(
+            worker = worker.0,
+            job = job.0,
+            tile = tile.number(),
+            "a worker brought pixels that two others contradict; it is kept out from now on"
+        ),
+        Notice::TakenBack { worker, job, tiles } => tracing::warn!(
+            worker = worker.0,
+            job = job.0,
+            tiles = %list(&tiles),
+            "tiles of a worker that is kept out are rendered again"
+        ),
+        Notice::NoAudit => {
+            tracing::warn!("tiles are not compared: nobody is there to render them again");
+        }
         Notice::JobFailed(job, reason) => tracing::warn!(job = job.0, reason, "job failed"),
         Notice::NotGranted { worker, lease, tile, count } => {
             tracing::warn!(

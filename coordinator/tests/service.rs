@@ -47,6 +47,7 @@ impl Farm {
         let coordinator = Coordinator::new(Config {
             version: VERSION.to_owned(),
             term: Duration::from_millis(300),
+            audit: 0.0,
             upload_silence: Duration::from_millis(600),
             scene_folder: folder.path().to_owned(),
             picture_folder: folder.path().to_owned(),
@@ -208,7 +209,7 @@ async fn a_lease_without_progress_is_given_again_and_late_pixels_count() {
     };
     let renewal = wire::RenewRequest {
         worker: farm.worker,
-        renewals: vec![wire::Renewal { lease: Some(late.into()), work: 1 }],
+        renewals: vec![wire::Renewal { lease: Some(late.into()), work: 1, tiles: vec![] }],
         incarnation: farm.incarnation,
     };
     let lost = farm.tiles.renew(renewal).await.unwrap().into_inner().lost;
@@ -407,7 +408,7 @@ async fn calls_meant_for_another_start_of_the_coordinator_are_refused() {
     let status = farm.tiles.lease(request).await.unwrap_err();
     assert_eq!(status.code(), Code::NotFound);
     assert!(status.message().contains("not meant for this start"), "{status}");
-    let renewals = vec![wire::Renewal { lease: Some(lease.into()), work: 1 }];
+    let renewals = vec![wire::Renewal { lease: Some(lease.into()), work: 1, tiles: vec![] }];
     let request = wire::RenewRequest { worker, incarnation, renewals };
     assert_eq!(farm.tiles.renew(request).await.unwrap_err().code(), Code::NotFound);
     let request = wire::LeaveRequest { worker, incarnation, reason: String::new() };

@@ -18,6 +18,7 @@ use crate::{
     error::WorkerError,
     job::Job,
     outbox::{Rendered, TURN},
+    pulse::Object,
     scene::SceneError,
     task::{Action, GivenUp, TaskId, Tasks},
 };
@@ -96,10 +97,12 @@ struct Member {
 struct Held {
     /// Tiles that are not on their way to the coordinator yet: at least one.
     tiles_left: usize,
-    /// Signs of progress under it.
+    /// Steps that brought its scene.
     work: u64,
-    /// Those of them that the coordinator was told of.
-    told: u64,
+    /// Tiles of those left that were begun, and the steps that were made for each.
+    begun: BTreeMap<TileId, u64>,
+    /// There were steps of which the coordinator was not told yet.
+    has_news: bool,
 }
 
 #[derive(Debug)]
@@ -215,12 +218,14 @@ impl Worker {
         }
     }
 
-    /// Event: threads or a fetch have made so much progress under leases since the last time.
-    pub(crate) fn on_beat(&mut self, beats: &BTreeMap<LeaseName, u64>, now: Instant) {
+    /// Event: threads or a fetch have made so many steps since the last time.
+    pub(crate) fn on_beat(&mut self, beats: &BTreeMap<Object, u64>, now: Instant) {
         if let Stage::Working(member) = &mut self.stage {
-            for (lease, count) in beats {
-                if let Some(held) = member.leases.get_mut(lease) {
-                    held.work += count;
+            for (&(lease, tile), count) in beats {
+                if let Some(held) = member.leases.get_mut(&lease) {
+                    *tile.map_or(&mut held.work, |tile| held.begun.entry(tile).or_default()) +=
+                        count;
+                    held.has_news = true;
                 }
             }
             self.proceed(now);
@@ -345,7 +350,8 @@ impl Member {
         if run.tiles.is_empty() {
             return;
         }
-        let held = Held { tiles_left: run.tiles.len(), work: 0, told: 0 };
+        let (tiles_left, begun) = (run.tiles.len(), BTreeMap::new());
+        let held = Held { tiles_left, work: 0, begun, has_news: false };
         self.leases.insert(run.lease, held);
         if self.scenes.contains(&run.job.scene) {
             self.queue(run);
@@ -411,7 +417,7 @@ impl Member {
             tiles.extend(self.rendered.pop_front());
         }
         for tile in &tiles {
-            self.on_tile_sent(tile.lease);
+            self.on_tile_sent(tile.lease, tile.tile);
         }
         self.delivering_count += tiles.len();
         tiles
@@ -445,12 +451,13 @@ impl Member {
             let most_tiles = longest * self.threads;
             tasks.call(Call::Lease { member: self.id, most_tiles, wait: LONGEST_WAIT }, now);
         }
-        let has_news = self.leases.values().any(|held| held.work > held.told);
+        let has_news = self.leases.values().any(|held| held.has_news);
         if has_news && !self.is_renewing {
             self.is_renewing = true;
             let renewals = self.leases.iter_mut().map(|(&lease, held)| {
-                held.told = held.work;
-                Renewal { lease, work: held.work }
+                held.has_news = false;
+                let tiles = held.begun.iter().map(|(tile, &work)| (tile.number(), work));
+                Renewal { lease, work: held.work, tiles: tiles.collect() }
             });
             let renewals = renewals.collect();
             tasks.call(Call::Renew { member: self.id, renewals }, now);
@@ -467,9 +474,10 @@ impl Member {
         self.rendering_count < TURNS_AT_HAND * turns && pixels < MOST_TURNS_OF_PIXELS * turns
     }
 
-    fn on_tile_sent(&mut self, name: LeaseName) {
+    fn on_tile_sent(&mut self, name: LeaseName, tile: TileId) {
         if let Some(held) = self.leases.get_mut(&name) {
             held.tiles_left -= 1;
+            held.begun.remove(&tile);
             if held.tiles_left == 0 {
                 self.leases.remove(&name);
             }

@@ -244,9 +244,16 @@ impl Bench {
         (lease, tile)
     }
 
-    /// A sign of progress under a lease.
+    /// A step that brings the scene of a lease.
     fn beat(&mut self, number: u64) {
-        self.worker.on_beat(&BTreeMap::from([(lease(number), 1)]), self.now);
+        self.worker.on_beat(&BTreeMap::from([((lease(number), None), 1)]), self.now);
+        self.absorb();
+    }
+
+    /// A step for a tile of a lease.
+    fn step(&mut self, number: u64, tile: u32) {
+        let tile = grid().tile(tile);
+        self.worker.on_beat(&BTreeMap::from([((lease(number), tile), 1)]), self.now);
         self.absorb();
     }
 
@@ -380,20 +387,31 @@ fn pixels_are_kept_until_they_are_acknowledged() {
 }
 
 #[test]
-fn progress_renews_its_own_lease_one_renewal_at_a_time() {
-    let mut bench = Bench::rendering(1, 1);
+fn progress_is_told_tile_by_tile_one_renewal_at_a_time() {
+    let mut bench = Bench::rendering(1, 2);
     bench.answer(is_lease, run(2, 9, 0));
     assert!(!bench.has(is_renew), "time alone renews nothing");
-    bench.beat(1);
-    bench.beat(1);
+    bench.step(1, 0);
+    bench.step(1, 0);
+    bench.step(1, 1);
     bench.beat(2);
-    for works in [[1, 0], [2, 1]] {
+    let mut check_renewal = |expected: [(u64, &[(u32, u64)]); 2]| {
         let renewed = bench.answer(is_renew, Answer::Renewed { lost: vec![] });
-        let renewal = |(number, work)| Renewal { lease: lease(number), work };
-        let renewals = (1..).zip(works).map(renewal).collect();
-        assert_eq!(renewed, Call::Renew { member: member(1), renewals });
-    }
+        let renewals = (1..).zip(expected).map(|(number, (work, tiles))| Renewal {
+            lease: lease(number),
+            work,
+            tiles: tiles.to_vec(),
+        });
+        assert_eq!(renewed, Call::Renew { member: member(1), renewals: renewals.collect() });
+    };
+    check_renewal([(0, &[(0, 1)]), (0, &[])]);
+    check_renewal([(0, &[(0, 2), (1, 1)]), (1, &[])]);
     assert!(!bench.has(is_renew), "nothing new to tell");
+    bench.render();
+    bench.step(1, 1);
+    let renewed = bench.answer(is_renew, Answer::Renewed { lost: vec![] });
+    let Call::Renew { renewals, .. } = renewed else { panic!("{renewed:?}") };
+    assert_eq!(renewals[0].tiles, [(1, 2)], "what is on its way is told no more");
 }
 
 #[test]
@@ -906,7 +924,7 @@ fn simulate(seed: u64) {
                 bench.worker.on_tiles_rendered(vec![(task, pixels)], bench.now);
             }
             Letter::Beat(lease) => {
-                bench.worker.on_beat(&BTreeMap::from([(lease, 1)]), bench.now);
+                bench.worker.on_beat(&BTreeMap::from([((lease, None), 1)]), bench.now);
             }
         }
         bench.absorb();
