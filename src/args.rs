@@ -6,7 +6,7 @@ use clap::{Args as ClapArgs, Parser, Subcommand, ValueEnum, value_parser};
 use rtfarm_core::{
     isa::{Isa, IsaError},
     render::{Cutoff, Quality, SampleCount, SampleLimit, Sampling, StandardError},
-    tile::{Size, SizeError, TileGrid},
+    tile::{Crop, Size, SizeError, TileGrid},
     transfer::Transfer,
 };
 use rtfarm_job::RenderRequest;
@@ -118,6 +118,11 @@ pub(crate) struct PictureArgs {
     /// The picture's size in pixels; the size that the scene asks for by default.
     #[arg(long, value_name = "WxH", value_parser = parse_size)]
     size: Option<Size>,
+
+    /// Show only the window whose upper left pixel is X,Y, of W columns and H rows. Its pixels are
+    /// those of the whole picture, to the bit.
+    #[arg(long, value_name = "X,Y,W,H", value_parser = parse_crop)]
+    crop: Option<Crop>,
 
     /// The same number of samples in every pixel.
     #[arg(long, value_name = "N", value_parser = parse_samples, conflicts_with_all = ["error", "max_samples"])]
@@ -360,6 +365,7 @@ impl PictureArgs {
                 secondary: matches!(self.secondary, Switch::On),
                 cutoff: self.cutoff,
             },
+            crop: self.crop,
             tile_side: self.tile,
             transfer: self.transfer,
             format,
@@ -405,6 +411,14 @@ fn parse_size(text: &str) -> Result<Size, String> {
     let sides = text.split_once('x').and_then(|(w, h)| Some((w.parse().ok()?, h.parse().ok()?)));
     let (width, height) = sides.ok_or("a size looks like 1280x720")?;
     Size::new(width, height).map_err(|error: SizeError| error.to_string())
+}
+
+fn parse_crop(text: &str) -> Result<Crop, &'static str> {
+    let numbers: Option<Vec<u32>> = text.split(',').map(|number| number.parse().ok()).collect();
+    match numbers.as_deref() {
+        Some(&[x, y, width, height]) => Ok(Crop { corner: [x, y], sides: [width, height] }),
+        _ => Err("a crop window looks like 320,180,640,360: x, y, width and height in pixels"),
+    }
 }
 
 fn parse_samples(text: &str) -> Result<SampleCount, String> {

@@ -27,7 +27,7 @@ pub(crate) fn render(
     stop: &CancellationToken,
 ) -> anyhow::Result<Option<(Picture, Duration)>> {
     let Order { prepared, settings, grid, transfer, format, .. } = order;
-    let picture = Picture::new_in(folder, settings.size, format, transfer)
+    let picture = Picture::new_in(folder, grid.window(), format, transfer)
         .with_context(|| format!("cannot make the picture's file in {}", folder.display()))?;
     let scene = PreparedScene::open(prepared)?;
     let pool = ThreadPoolBuilder::new().num_threads(threads).build()?;

@@ -7,7 +7,7 @@ use rtfarm_core::{
     isa::Isa,
     prepared::{PreparedBytes, PreparedScene},
     render::{Quality, Sampling, render_tile},
-    tile::{Area, Size},
+    tile::Area,
 };
 use rtfarm_job::Order;
 use rtfarm_ladder::adaptive_settings;
@@ -35,10 +35,10 @@ pub(crate) fn choose(
     let started = Instant::now();
     let scene = PreparedScene::open(PreparedBytes::copy_from(order.prepared.as_ref()))?;
     let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build()?;
-    let size = order.settings.size;
-    let squares = squares(size);
+    let window = order.grid.window();
+    let squares = squares(window);
     let pixels: usize = squares.iter().map(|square| square.pixel_count()).sum();
-    let whole = size.pixel_count() as f64 / pixels as f64;
+    let whole = window.pixel_count() as f64 / pixels as f64;
     let mut chosen = None;
     for sampling in adaptive_settings() {
         let quality = Quality { sampling, ..order.settings.quality };
@@ -68,8 +68,8 @@ pub(crate) fn choose(
     Ok(chosen.or_else(|| adaptive_settings().next()))
 }
 
-/// Squares all over the frame.
-fn squares(size: Size) -> Vec<Area> {
+/// Squares all over the window.
+fn squares(window: Area) -> Vec<Area> {
     let places = |length: u32| -> Vec<(u32, u32)> {
         let count = SQUARES.min(length.div_ceil(SIDE));
         (0..count)
@@ -80,10 +80,11 @@ fn squares(size: Size) -> Vec<Area> {
             })
             .collect()
     };
-    let (columns, rows) = (places(size.width()), places(size.height()));
+    let (columns, rows) = (places(window.width()), places(window.height()));
     let across = |(y0, height)| {
         columns.iter().map(move |&(x0, width)| {
-            Area::new(size, [x0, y0], [width, height]).expect("a square inside the frame")
+            let corner = [window.x0() + x0, window.y0() + y0];
+            Area::new(window.frame(), corner, [width, height]).expect("a square of the window")
         })
     };
     rows.iter().copied().flat_map(across).collect()
@@ -91,14 +92,18 @@ fn squares(size: Size) -> Vec<Area> {
 
 #[cfg(test)]
 mod tests {
+    use rtfarm_core::tile::Size;
+
     use super::*;
 
     #[test]
-    fn squares_lie_in_the_frame() {
+    fn squares_lie_in_the_window() {
         for (width, height) in [(1, 1), (17, 3), (100, 75), (65_535, 2), (1280, 720)] {
-            for area in squares(Size::new(width, height).unwrap()) {
-                assert!(u64::from(area.columns().end) <= width, "{area:?}");
-                assert!(u64::from(area.rows().end) <= height, "{area:?}");
+            let frame = Size::new(width, height).unwrap();
+            let corner = [frame.width() / 3, frame.height() / 3];
+            let sides = [frame.width() - corner[0], frame.height() - corner[1]];
+            for window in [Area::whole(frame), Area::new(frame, corner, sides).unwrap()] {
+                assert!(squares(window).into_iter().all(|square| window.has(square)));
             }
         }
     }

@@ -188,7 +188,7 @@ async fn render_here(
     console: &Console,
     stop: &CancellationToken,
 ) -> Result<Summary, Failure> {
-    let (size, sampling) = (order.settings.size, order.settings.quality.sampling);
+    let (size, sampling) = (order.grid.window().size(), order.settings.quality.sampling);
     let transfer = order.transfer;
     let tile_count = order.grid.count();
     let progress = watch::Sender::new(Progress { tile_count, ..Progress::default() });

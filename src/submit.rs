@@ -295,6 +295,7 @@ impl Shell<'_> {
             frame: request.size.map(Into::into),
             quality: Some(request.quality.into()),
             strict: request.strict,
+            crop: request.crop.map(Into::into),
             tile_side: request.tile_side.map_or(0, |side| side as u32),
             format: wire::Format::from(request.format).into(),
             transfer: wire::Transfer::from(request.transfer).into(),

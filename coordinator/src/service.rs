@@ -12,13 +12,13 @@ use std::{
 use rtfarm_core::{
     language::{Style, draw_diagnostics},
     render::Tally,
-    tile::Size,
+    tile::{Crop, Size},
 };
 use rtfarm_job::{Outcome, Placed, Progress, Refusal, RenderRequest};
-use rtfarm_picture::check_pixels;
+use rtfarm_picture::TilePixels;
 use rtfarm_proto::{
     CHUNK_BYTES, JobId, LONGEST_WAIT, LeaseName, MESSAGE_BYTES, PROTOCOL, Renewal, WireError,
-    WorkerId, pixels_from_bytes, scene_hash, transfer,
+    WorkerId, scene_hash, transfer,
     wire::{
         self, event, farm_server, jobs_server, lease_response, submit_request, submit_response,
     },
@@ -138,20 +138,18 @@ impl farm_server::Farm for FarmService {
         request: Request<wire::DeliverRequest>,
     ) -> Result<Response<wire::DeliverResponse>, Status> {
         let shell = Arc::clone(&self.shell);
-        let delivery = request.into_inner();
-        self.shell.admit(delivery.incarnation).map_err(stranger)?;
-        let (worker, tile) = (delivery.worker, delivery.tile);
-        let verdict = match blocking(move || take(&shell, &delivery)).await? {
-            Some(verdict) => verdict.await.expect("every delivery is answered"),
-            None => Verdict::Rejected,
-        };
-        tracing::debug!(worker, tile, ?verdict, "answered");
-        let verdict = match verdict {
-            Verdict::Accepted => wire::Verdict::Accepted,
-            Verdict::Duplicate => wire::Verdict::Duplicate,
-            Verdict::Rejected => wire::Verdict::Rejected,
-        };
-        Ok(Response::new(wire::DeliverResponse { verdict: verdict.into() }))
+        let wire::DeliverRequest { worker, incarnation, tiles } = request.into_inner();
+        self.shell.admit(incarnation).map_err(stranger)?;
+        let mut verdicts = vec![wire::Verdict::Rejected.into(); tiles.len()];
+        let taken = blocking(move || take(&shell, WorkerId(worker), tiles)).await?;
+        if let Some((places, decided)) = taken {
+            let decided = decided.await.expect("every delivery is answered");
+            for (place, verdict) in places.into_iter().zip(decided) {
+                verdicts[place] = to_verdict(verdict).into();
+            }
+        }
+        tracing::debug!(worker, ?verdicts, "answered");
+        Ok(Response::new(wire::DeliverResponse { verdicts }))
     }
 
     async fn leave(
@@ -180,29 +178,46 @@ impl farm_server::Farm for FarmService {
     }
 }
 
-/// Reads a delivery and hands it on. `None` when there is no such tile, or the pixels are none of
-/// it. This hashes and writes: never call it on the async runtime.
+/// The places in a message of tiles that were handed on, and what is decided about each of them.
+type Taken = (Vec<usize>, oneshot::Receiver<Vec<Verdict>>);
+
+/// Reads tiles and hands on those that there are and whose pixels make sense. `None` when none does.
+/// This hashes and writes: never call it on the async runtime.
 fn take(
     shell: &Shell,
-    request: &wire::DeliverRequest,
-) -> Result<Option<oneshot::Receiver<Verdict>>, Status> {
-    let lease = request.lease.ok_or_else(|| invalid(WireError::Missing("lease")))?;
-    let (worker, lease) = (WorkerId(request.worker), LeaseName::from(lease));
-    let Some((tile, job)) = shell.tile(lease.job, request.tile) else { return Ok(None) };
-    let hash: PixelHash = job.hasher.hash(tile, &request.pixels);
-    let pixels = pixels_from_bytes(&request.pixels).map_err(invalid)?;
-    let tally = request.tally.ok_or_else(|| invalid(WireError::Missing("tally")))?;
-    let tally = Tally::try_from(tally).map_err(invalid)?;
-    if request.hash != hash[..] {
-        tracing::error!(worker = worker.0, tile = tile.number(), "pixels were damaged");
-        return Err(Status::data_loss("the pixels do not have the hash they came with"));
+    worker: WorkerId,
+    tiles: Vec<wire::FinishedTile>,
+) -> Result<Option<Taken>, Status> {
+    let (mut places, mut good) = (Vec::new(), Vec::with_capacity(tiles.len()));
+    for (place, finished) in tiles.into_iter().enumerate() {
+        let lease = finished.lease.ok_or_else(|| invalid(WireError::Missing("lease")))?;
+        let lease = LeaseName::from(lease);
+        let Some((tile, job)) = shell.tile(lease.job, finished.tile) else { continue };
+        let hash: PixelHash = job.hasher.hash(tile, &finished.pixels);
+        let tally = finished.tally.ok_or_else(|| invalid(WireError::Missing("tally")))?;
+        let tally = Tally::try_from(tally).map_err(invalid)?;
+        if finished.hash != hash[..] {
+            tracing::error!(worker = worker.0, tile = tile.number(), "pixels were damaged");
+            return Err(Status::data_loss("the pixels do not have the hash they came with"));
+        }
+        let pixels = TilePixels { area: job.grid.area(tile), bytes: &finished.pixels };
+        if let Err(error) = pixels.check() {
+            shell.report_senseless_pixels(worker, lease, tile, &error.to_string());
+            continue;
+        }
+        places.push(place);
+        let delivery = Delivery { worker, lease, tile, hash, seconds: finished.seconds, tally };
+        good.push((delivery, finished.pixels));
     }
-    if let Err(error) = check_pixels(job.grid.area(tile), &pixels) {
-        shell.report_senseless_pixels(worker, lease, tile, &error.to_string());
-        return Ok(None);
+    Ok((!good.is_empty()).then(|| (places, shell.deliver(good))))
+}
+
+fn to_verdict(verdict: Verdict) -> wire::Verdict {
+    match verdict {
+        Verdict::Accepted => wire::Verdict::Accepted,
+        Verdict::Duplicate => wire::Verdict::Duplicate,
+        Verdict::Rejected => wire::Verdict::Rejected,
     }
-    let delivery = Delivery { worker, lease, tile, hash, seconds: request.seconds, tally };
-    Ok(Some(shell.deliver(delivery, pixels)))
 }
 
 struct JobsService {
@@ -243,7 +258,7 @@ impl jobs_server::Jobs for JobsService {
             let outcome = match job {
                 Ok(job) => submit_response::Outcome::Accepted(wire::Accepted {
                     job: job.id.0,
-                    frame: Some(job.settings.size.into()),
+                    frame: Some(job.grid.window().size().into()),
                     tile_count: job.grid.count(),
                     farm: identity.farm.0.to_vec().into(),
                     incarnation: identity.incarnation.0,
@@ -421,9 +436,10 @@ fn to_request(order: wire::Order) -> Result<RenderRequest, WireError> {
     let size = order.frame.map(Size::try_from).transpose()?;
     let transfer = transfer(order.transfer)?;
     let quality = order.quality.ok_or(WireError::Missing("quality"))?.try_into()?;
-    let wire::Order { name, strict, tile_side, .. } = order;
+    let wire::Order { name, strict, tile_side, crop, .. } = order;
     let tile_side = (tile_side > 0).then_some(tile_side.into());
-    Ok(RenderRequest { name, strict, size, quality, tile_side, transfer, format })
+    let crop = crop.map(Into::into);
+    Ok(RenderRequest { name, strict, size, crop, quality, tile_side, transfer, format })
 }
 
 fn to_event(progress: &Progress) -> wire::Event {
@@ -451,6 +467,7 @@ fn to_run(run: &Run, job: &Job, is_local: bool) -> wire::Run {
         scene_path: path.unwrap_or_default().to_owned(),
         settings: Some(job.settings.into()),
         tile_side: job.grid.side(),
+        window: Some(Crop::from(job.grid.window()).into()),
     };
     wire::Run {
         lease: Some(run.lease.into()),
@@ -517,14 +534,9 @@ fn check_pixels_of(request: &wire::JoinRequest, shell: &Shell) -> Result<(), Sta
     } else if let Some(ours) = ours
         && reference != &ours[..]
     {
-        let hex = |bytes: &[u8]| -> String {
-            bytes.iter().take(8).map(|byte| format!("{byte:02x}")).collect()
-        };
         format!(
-            "this worker renders the reference tile with other pixels than the coordinator ({theirs} \
-             with {isa}, instead of {ours}); its compiler or its processor errs",
-            theirs = hex(reference),
-            ours = hex(ours)
+            "this worker, with {isa}, makes other pixels of the reference tile than the coordinator; \
+             its compiler or its processor errs"
         )
     } else {
         return Ok(());

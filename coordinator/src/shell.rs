@@ -12,8 +12,8 @@ use std::{
 
 use rtfarm_core::{prepared::SceneHash, tile::TileId};
 use rtfarm_job::{FinishedTile, Order, Progress};
-use rtfarm_picture::Picture;
-use rtfarm_proto::{Incarnation, JobId, LeaseName, Renewal, TileHasher, WorkerId};
+use rtfarm_picture::{Picture, TilePixels};
+use rtfarm_proto::{Bytes, Incarnation, JobId, LeaseName, Renewal, TileHasher, WorkerId};
 use tokio::sync::{Notify, oneshot, watch};
 use tokio_util::sync::CancellationToken;
 
@@ -82,32 +82,48 @@ struct State {
     jobs: BTreeMap<JobId, Arc<Job>>,
     /// Questions that the machine has not answered.
     asks: HashMap<AskId, oneshot::Sender<Result<Next, NoMember>>>,
-    /// Deliveries that the machine has not answered.
-    deliveries: HashMap<DeliveryId, Undecided>,
+    /// What workers brought and the machine has not answered, by the number of its first tile.
+    batches: BTreeMap<DeliveryId, Batch>,
     /// The number of the last question or delivery.
     last_number: u64,
     /// When the machine will be woken.
     wakes_at: Option<Instant>,
 }
 
+/// Tiles that came in one message. Their deliveries have consecutive numbers.
 #[derive(Debug)]
-struct Undecided {
-    /// Taken out when they are stored.
-    pixels: Vec<[f32; 3]>,
-    reply: oneshot::Sender<Verdict>,
+struct Batch {
+    /// Of each tile. They are taken out when they are stored.
+    pixels: Vec<Bytes>,
+    verdicts: Vec<Verdict>,
+    undecided_count: usize,
+    reply: oneshot::Sender<Vec<Verdict>>,
 }
 
 /// What is done after the state is unlocked, since it may take a while.
+#[derive(Default)]
+struct Works {
+    in_order: Vec<Work>,
+    /// How far jobs are, for those who watch them: the last word only, after all else.
+    progress: BTreeMap<JobId, (Arc<Job>, Progress)>,
+}
+
 enum Work {
     Log(Notice),
-    Publish(Arc<Job>, Progress),
-    Store {
-        job: Arc<Job>,
-        tile: TileId,
-        pixels: Vec<[f32; 3]>,
-    },
+    /// Writes tiles into a job's picture.
+    Store(Arc<Job>, Vec<(TileId, Bytes)>),
     /// Removes the files of a job that nobody else has in hand.
     Drop(Arc<Job>),
+}
+
+impl Works {
+    /// Has a tile written, together with those before it.
+    fn store(&mut self, job: Arc<Job>, tile: TileId, pixels: Bytes) {
+        match self.in_order.last_mut() {
+            Some(Work::Store(last, tiles)) if last.id == job.id => tiles.push((tile, pixels)),
+            _ => self.in_order.push(Work::Store(job, vec![(tile, pixels)])),
+        }
+    }
 }
 
 impl Shell {
@@ -119,7 +135,7 @@ impl Shell {
             farm: Farm::new(identity, config.term, audit),
             jobs: BTreeMap::new(),
             asks: HashMap::new(),
-            deliveries: HashMap::new(),
+            batches: BTreeMap::new(),
             last_number: 0,
             wakes_at: None,
         };
@@ -138,13 +154,13 @@ impl Shell {
 
     /// Hands an event to the machine and does what it answers.
     fn tell<T>(&self, event: impl FnOnce(&mut State, Instant) -> (T, Vec<Action>)) -> T {
-        let mut works = Vec::new();
+        let mut works = Works::default();
         let value = {
             let mut state = self.state();
             // Under the lock, so that the machine's time never runs backwards.
             let (value, actions) = event(&mut state, tokio::time::Instant::now().into_std());
             for action in actions {
-                works.extend(self.act(&mut state, action));
+                self.act(&mut state, action, &mut works);
             }
             let wake = state.farm.next_wake();
             if wake.is_some_and(|wake| state.wakes_at.is_none_or(|at| wake < at)) {
@@ -153,8 +169,11 @@ impl Shell {
             }
             value
         };
-        for work in works {
+        for work in works.in_order {
             self.do_work(work);
+        }
+        for (job, progress) in works.progress.into_values() {
+            job.publish(progress);
         }
         value
     }
@@ -164,7 +183,7 @@ impl Shell {
     }
 
     /// Does at once what must be done in the order decided, and is quick.
-    fn act(&self, state: &mut State, action: Action) -> Option<Work> {
+    fn act(&self, state: &mut State, action: Action, works: &mut Works) {
         match action {
             Action::Answer(ask, answer) => {
                 if let Some(reply) = state.asks.remove(&ask) {
@@ -172,36 +191,42 @@ impl Shell {
                     let _ = reply.send(answer);
                 }
             }
-            Action::Acknowledge(delivery, verdict) => {
-                if let Some(undecided) = state.deliveries.remove(&delivery) {
-                    // The worker may have gone; another delivers the tile again.
-                    let _ = undecided.reply.send(verdict);
+            Action::Acknowledge(delivery, verdict) => state.acknowledge(delivery, verdict),
+            Action::Publish(job, progress) => {
+                if let Some(known) = state.jobs.get(&job) {
+                    works.progress.insert(job, (Arc::clone(known), progress));
                 }
             }
-            Action::Publish(job, progress) => {
-                let job = state.jobs.get(&job)?;
-                return Some(Work::Publish(Arc::clone(job), progress));
-            }
             Action::Store(delivery, job, tile) => {
-                let job = Arc::clone(state.jobs.get(&job)?);
-                let pixels = std::mem::take(&mut state.deliveries.get_mut(&delivery)?.pixels);
-                return Some(Work::Store { job, tile, pixels });
+                let pixels = state
+                    .batch(delivery)
+                    .map(|(batch, index)| std::mem::take(&mut batch.pixels[index]));
+                if let (Some(pixels), Some(job)) = (pixels, state.jobs.get(&job)) {
+                    works.store(Arc::clone(job), tile, pixels);
+                }
             }
-            Action::Forget(job) => return state.jobs.remove(&job).map(Work::Drop),
-            Action::Log(notice) => return Some(Work::Log(notice)),
+            Action::Forget(job) => {
+                works.in_order.extend(state.jobs.remove(&job).map(Work::Drop));
+            }
+            Action::Log(notice) => works.in_order.push(Work::Log(notice)),
             Action::Stop => self.stop.cancel(),
         }
-        None
     }
 
     fn do_work(&self, work: Work) {
         match work {
             Work::Log(notice) => log(notice),
-            Work::Publish(job, progress) => job.publish(progress),
             Work::Drop(job) => drop(job),
-            Work::Store { job, tile, pixels } => {
-                match job.picture.put(job.grid.area(tile), &pixels) {
-                    Ok(()) => self.tell_farm(|farm, now| farm.on_stored(job.id, tile, now)),
+            Work::Store(job, tiles) => {
+                let pixels = tiles.iter().map(|(tile, bytes)| {
+                    let area = job.grid.area(*tile);
+                    TilePixels { area, bytes }
+                });
+                match job.picture.put_all(&pixels.collect::<Vec<_>>()) {
+                    Ok(()) => self.tell_farm(|farm, now| {
+                        let stored = |&(tile, _): &(TileId, _)| farm.on_stored(job.id, tile, now);
+                        tiles.iter().flat_map(stored).collect()
+                    }),
                     Err(error) => {
                         self.tell_farm(|farm, _| farm.on_store_failed(job.id, error.to_string()));
                     }
@@ -272,20 +297,23 @@ impl Shell {
         Some((tile, Arc::clone(state.jobs.get(&job)?)))
     }
 
-    /// Brings the pixels of a tile. The answer comes when they are safe. This writes a file: never
+    /// Brings the pixels of tiles. The verdicts come when all are safe. This writes a file: never
     /// call it on the async runtime.
-    pub(crate) fn deliver(
-        &self,
-        delivery: Delivery,
-        pixels: Vec<[f32; 3]>,
-    ) -> oneshot::Receiver<Verdict> {
-        let (reply, verdict) = oneshot::channel();
+    pub(crate) fn deliver(&self, tiles: Vec<(Delivery, Bytes)>) -> oneshot::Receiver<Vec<Verdict>> {
+        let (reply, verdicts) = oneshot::channel();
+        let (deliveries, pixels): (Vec<Delivery>, Vec<Bytes>) = tiles.into_iter().unzip();
+        let count = deliveries.len();
         self.tell(|state, now| {
-            let id = DeliveryId(state.next_number());
-            state.deliveries.insert(id, Undecided { pixels, reply });
-            ((), state.farm.on_pixels(id, delivery, now))
+            let first = state.last_number + 1;
+            state.last_number += count as u64;
+            let verdicts = vec![Verdict::Rejected; count];
+            let batch = Batch { pixels, verdicts, undecided_count: count, reply };
+            state.batches.insert(DeliveryId(first), batch);
+            let numbered = (first..).map(DeliveryId).zip(deliveries);
+            let arrived = |(id, delivery)| state.farm.on_pixels(id, delivery, now);
+            ((), numbered.flat_map(arrived).collect())
         });
-        verdict
+        verdicts
     }
 
     pub(crate) fn report_senseless_pixels(
@@ -313,14 +341,14 @@ impl Shell {
         let scene = SceneFile::write(scene_folder, &prepared)
             .map_err(|error| SubmitError::Scene(scene_folder.clone(), error))?;
         drop(prepared);
-        let picture = Picture::new_in(picture_folder, settings.size, format, transfer)
+        let picture = Picture::new_in(picture_folder, grid.window(), format, transfer)
             .map_err(|error| SubmitError::Picture(picture_folder.clone(), error))?;
 
         let id = self.state().farm.number_job();
         tracing::info!(
             job = id.0,
             scene = name,
-            size = %settings.size,
+            size = %grid.window().size(),
             sampling = %settings.quality.sampling,
             ?transfer,
             tiles = grid.count(),
@@ -330,7 +358,7 @@ impl Shell {
         );
         let progress =
             watch::Sender::new(Progress { tile_count: grid.count(), ..Progress::default() });
-        let hasher = TileHasher::new(id, scene.hash(), settings, grid.side());
+        let hasher = TileHasher::new(id, scene.hash(), settings, grid);
         let job = Arc::new(Job { id, scene, settings, grid, hasher, picture, progress });
         // Not under the lock: there may be a million.
         let tiles = Tiles::new(grid);
@@ -365,6 +393,27 @@ impl Shell {
 }
 
 impl State {
+    /// The message that brought a tile, and which of its tiles that is.
+    fn batch(&mut self, delivery: DeliveryId) -> Option<(&mut Batch, usize)> {
+        let (first, batch) = self.batches.range_mut(..=delivery).next_back()?;
+        let index = (delivery.0 - first.0) as usize;
+        (index < batch.verdicts.len()).then_some((batch, index))
+    }
+
+    /// Answers a message when all of its tiles have a verdict.
+    fn acknowledge(&mut self, delivery: DeliveryId, verdict: Verdict) {
+        let Some((batch, index)) = self.batch(delivery) else { return };
+        batch.verdicts[index] = verdict;
+        batch.undecided_count -= 1;
+        let first = DeliveryId(delivery.0 - index as u64);
+        if batch.undecided_count == 0
+            && let Some(batch) = self.batches.remove(&first)
+        {
+            // The worker may have gone; another delivers its tiles again.
+            let _ = batch.reply.send(batch.verdicts);
+        }
+    }
+
     fn next_number(&mut self) -> u64 {
         self.last_number += 1;
         self.last_number

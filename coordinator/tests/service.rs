@@ -107,7 +107,7 @@ impl Farm {
         tile: u32,
         value: f32,
     ) -> Result<wire::Verdict, Code> {
-        let pixels = pixels_to_bytes(&[[value; 3]; 64]);
+        let pixels = pixels_to_bytes(vec![[value; 3]; 64]);
         let hash = self.hash(tile, &pixels);
         self.send(lease, tile, pixels.to_vec(), hash).await
     }
@@ -116,7 +116,7 @@ impl Farm {
     fn hash(&self, tile: u32, pixels: &[u8]) -> Vec<u8> {
         let grid = TileGrid::new(self.settings.size, 8).unwrap();
         let tile = grid.tile(tile).or(grid.tile(0)).unwrap();
-        let hasher = TileHasher::new(JobId(self.job), self.scene, self.settings, 8);
+        let hasher = TileHasher::new(JobId(self.job), self.scene, self.settings, grid);
         hasher.hash(tile, pixels).to_vec()
     }
 
@@ -127,18 +127,20 @@ impl Farm {
         pixels: Vec<u8>,
         hash: Vec<u8>,
     ) -> Result<wire::Verdict, Code> {
-        let delivery = wire::DeliverRequest {
-            worker: self.worker,
-            incarnation: self.incarnation,
-            lease: Some(lease.into()),
-            tile,
-            pixels: pixels.into(),
-            hash: hash.into(),
-            seconds: 0.1,
-            tally: Some(wire::Tally { rays: 64, ..wire::Tally::default() }),
-        };
+        let finished = finished(lease, tile, pixels, hash);
+        self.send_all(vec![finished]).await.map(|verdicts| verdicts[0])
+    }
+
+    async fn send_all(
+        &mut self,
+        tiles: Vec<wire::FinishedTile>,
+    ) -> Result<Vec<wire::Verdict>, Code> {
+        let (worker, incarnation) = (self.worker, self.incarnation);
+        let delivery = wire::DeliverRequest { worker, incarnation, tiles };
         let answer = self.tiles.deliver(delivery).await;
-        answer.map(|answer| answer.into_inner().verdict()).map_err(|status| status.code())
+        answer
+            .map(|answer| answer.into_inner().verdicts().collect())
+            .map_err(|status| status.code())
     }
 
     /// The state of the job now.
@@ -146,6 +148,17 @@ impl Farm {
         let request = wire::WatchRequest { job: self.job, incarnation: self.incarnation };
         let mut events = self.jobs.watch(request).await.unwrap().into_inner();
         events.message().await.unwrap().unwrap()
+    }
+}
+
+fn finished(lease: LeaseName, tile: u32, pixels: Vec<u8>, hash: Vec<u8>) -> wire::FinishedTile {
+    wire::FinishedTile {
+        lease: Some(lease.into()),
+        tile,
+        pixels: pixels.into(),
+        hash: hash.into(),
+        seconds: 0.1,
+        tally: Some(wire::Tally { rays: 64, ..wire::Tally::default() }),
     }
 }
 
@@ -189,9 +202,9 @@ async fn a_worker_that_would_make_other_pixels_is_refused_and_told_why() {
         ),
         (
             wire::JoinRequest { reference: vec![0xcd; 32].into(), ..join(VERSION) },
-            "(cdcdcdcdcdcdcdcd with avx2, instead of abababababababab)",
+            "with avx2, makes other pixels of the reference tile",
         ),
-        (wire::JoinRequest { reference: vec![].into(), ..join(VERSION) }, "( with avx2, instead"),
+        (wire::JoinRequest { reference: vec![].into(), ..join(VERSION) }, "reference tile"),
     ];
     for (request, reason) in refusals {
         let status = farm.tiles.join(request).await.unwrap_err();
@@ -236,6 +249,26 @@ async fn a_lease_without_progress_is_given_again_and_late_pixels_count() {
 }
 
 #[tokio::test]
+async fn tiles_of_one_message_are_decided_one_by_one() {
+    let mut farm = Farm::new().await;
+    let (lease, tiles) = farm.lease().await;
+    let bytes = vec![0; 64 * 12];
+    let good = finished(lease, tiles[0], bytes.clone(), farm.hash(tiles[0], &bytes));
+    let unknown = finished(lease, 99, bytes.clone(), farm.hash(99, &bytes));
+    let damaged = finished(lease, tiles[0], bytes, vec![7; 32]);
+    let verdicts = farm.send_all(vec![good.clone(), damaged]).await;
+    assert_eq!(verdicts, Err(Code::DataLoss), "the message is sent again");
+    assert_eq!(farm.state().await.tiles_done, 0);
+    let verdicts = farm.send_all(vec![unknown, good.clone(), good.clone()]).await;
+    let [rejected, accepted, duplicate] =
+        [wire::Verdict::Rejected, wire::Verdict::Accepted, wire::Verdict::Duplicate];
+    assert_eq!(verdicts, Ok(vec![rejected, accepted, duplicate]));
+    assert_eq!(farm.send_all(vec![good]).await, Ok(vec![duplicate]));
+    assert_eq!(farm.send_all(vec![]).await, Ok(vec![]));
+    assert_eq!(farm.state().await.tiles_done, 1);
+}
+
+#[tokio::test]
 async fn damaged_and_senseless_pixels_are_refused() {
     let mut farm = Farm::new().await;
     let (lease, tiles) = farm.lease().await;
@@ -244,12 +277,12 @@ async fn damaged_and_senseless_pixels_are_refused() {
     assert_eq!(farm.send(lease, tiles[0], bytes.clone(), vec![0; 32]).await, Err(Code::DataLoss));
     let short = vec![0; 13];
     let short_hash = farm.hash(tiles[0], &short);
-    assert_eq!(farm.send(lease, tiles[0], short, short_hash).await, Err(Code::InvalidArgument));
     let other_tile = farm.hash(1 - tiles[0], &bytes);
     assert_eq!(farm.send(lease, tiles[0], bytes.clone(), other_tile).await, Err(Code::DataLoss));
     let plain = blake3::hash(&bytes).as_bytes().to_vec();
     assert_eq!(farm.send(lease, tiles[0], bytes.clone(), plain).await, Err(Code::DataLoss));
     let rejected = Ok(wire::Verdict::Rejected);
+    assert_eq!(farm.send(lease, tiles[0], short, short_hash).await, rejected);
     assert_eq!(farm.send(lease, 99, vec![0; 64 * 12], hash).await, rejected);
     assert_eq!(farm.state().await.tiles_done, 0);
 

@@ -88,6 +88,21 @@ impl Area {
         self.frame
     }
 
+    /// Its size.
+    pub fn size(self) -> Size {
+        Size { width: self.width, height: self.height }
+    }
+
+    /// Whether all pixels of `other` are its own.
+    pub fn has(self, other: Self) -> bool {
+        let [columns, rows] = [self.columns(), self.rows()];
+        self.frame == other.frame
+            && columns.start <= other.x0
+            && rows.start <= other.y0
+            && other.columns().end <= columns.end
+            && other.rows().end <= rows.end
+    }
+
     /// The leftmost column.
     pub fn x0(self) -> u32 {
         self.x0
@@ -161,6 +176,50 @@ impl Area {
     }
 }
 
+impl From<Area> for Crop {
+    fn from(area: Area) -> Self {
+        Self { corner: [area.x0, area.y0], sides: [area.width, area.height] }
+    }
+}
+
+impl From<Size> for Area {
+    /// The whole of a frame.
+    fn from(frame: Size) -> Self {
+        Self::whole(frame)
+    }
+}
+
+/// A rectangle of pixels of a frame that is not known yet, y downwards.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Crop {
+    /// Its leftmost column and topmost row.
+    pub corner: [u32; 2],
+    /// Its columns and rows.
+    pub sides: [u32; 2],
+}
+
+/// A crop window that the frame does not have.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+#[error("a frame of {frame} pixels does not have all of the crop window {crop}")]
+pub struct CropError {
+    crop: Crop,
+    frame: Size,
+}
+
+impl Crop {
+    /// Its pixels of `frame`; an error where the frame lacks some of them or it is empty.
+    pub fn of(self, frame: Size) -> Result<Area, CropError> {
+        Area::new(frame, self.corner, self.sides).ok_or(CropError { crop: self, frame })
+    }
+}
+
+impl fmt::Display for Crop {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let ([x, y], [width, height]) = (self.corner, self.sides);
+        write!(f, "{x},{y},{width},{height}")
+    }
+}
+
 /// A tile of one frame, numbered row by row from the top left.
 /// Only [`TileGrid`] makes one, so it always lies inside the frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
@@ -178,10 +237,11 @@ impl TileId {
     }
 }
 
-/// A frame cut into squares of one side; those at the right and bottom edge may be narrower.
+/// The window of a frame that a picture shows, often the whole frame, cut into squares of one side;
+/// those at the right and bottom edge may be narrower.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct TileGrid {
-    size: Size,
+    window: Area,
     side: u32,
 }
 
@@ -195,27 +255,29 @@ impl TileGrid {
     /// above it a tile no longer fits a message.
     pub const SIDES: std::ops::RangeInclusive<u64> = 4..=1024;
 
-    /// Cuts `size` into squares of `side` pixels.
-    pub fn new(size: Size, side: u64) -> Result<Self, TileSideError> {
+    /// Cuts `window`, or the whole of a frame, into squares of `side` pixels.
+    pub fn new(window: impl Into<Area>, side: u64) -> Result<Self, TileSideError> {
         if Self::SIDES.contains(&side) {
-            Ok(Self { size, side: side as u32 })
+            Ok(Self { window: window.into(), side: side as u32 })
         } else {
             Err(TileSideError(side))
         }
     }
 
-    /// Cuts `size` into tiles of the power of two from 16 to 256 that gives nearest to 1000.
-    pub fn balanced(size: Size) -> Self {
+    /// Cuts `window`, or the whole of a frame, into tiles of the power of two from 16 to 256 that
+    /// gives nearest to 1000.
+    pub fn balanced(window: impl Into<Area>) -> Self {
+        let window = window.into();
         [16, 32, 64, 128, 256]
-            .map(|side| Self { size, side })
+            .map(|side| Self { window, side })
             .into_iter()
             .min_by_key(|grid| grid.count().abs_diff(1000))
             .expect("five sides were tried")
     }
 
-    /// The frame that is cut.
-    pub fn size(self) -> Size {
-        self.size
+    /// The pixels that are cut.
+    pub fn window(self) -> Area {
+        self.window
     }
 
     /// The side of a whole tile, in pixels.
@@ -225,33 +287,33 @@ impl TileGrid {
 
     /// Tiles in a row.
     pub fn columns(self) -> u32 {
-        self.size.width.div_ceil(self.side)
+        self.window.width.div_ceil(self.side)
     }
 
     /// Rows of tiles.
     pub fn rows(self) -> u32 {
-        self.size.height.div_ceil(self.side)
+        self.window.height.div_ceil(self.side)
     }
 
-    /// Tiles in the frame. At most 16 384² for the smallest side, which fits.
+    /// Tiles in the window. At most 16 384² for the smallest side, which fits.
     pub fn count(self) -> u32 {
         self.columns() * self.rows()
     }
 
-    /// Turns a number from the wire into a tile; `None` when the frame has no such tile.
+    /// Turns a number from the wire into a tile; `None` when the window has no such tile.
     pub fn tile(self, number: u32) -> Option<TileId> {
         (number < self.count()).then_some(TileId(number))
     }
 
     /// The pixels of a tile.
     pub fn area(self, tile: TileId) -> Area {
-        let (x0, y0) = (tile.0 % self.columns() * self.side, tile.0 / self.columns() * self.side);
+        let (x, y) = (tile.0 % self.columns() * self.side, tile.0 / self.columns() * self.side);
         Area {
-            frame: self.size,
-            x0,
-            y0,
-            width: self.side.min(self.size.width - x0),
-            height: self.side.min(self.size.height - y0),
+            frame: self.window.frame,
+            x0: self.window.x0 + x,
+            y0: self.window.y0 + y,
+            width: self.side.min(self.window.width - x),
+            height: self.side.min(self.window.height - y),
         }
     }
 
@@ -313,6 +375,20 @@ mod tests {
             }
         }
         assert!(seen.iter().all(|&count| count == 1));
+    }
+
+    #[test]
+    fn tiles_of_a_window_cover_it_and_no_more() {
+        let frame = Size::new(101, 67).unwrap();
+        let window = Area::new(frame, [13, 7], [40, 21]).unwrap();
+        let grid = TileGrid::new(window, 16).unwrap();
+        let tiles = (0..grid.count()).map(|number| grid.area(grid.tile(number).unwrap()));
+        let mut pixels: Vec<(u32, u32)> = tiles.clone().flat_map(Area::pixels).collect();
+        pixels.sort_unstable_by_key(|&(x, y)| (y, x));
+        assert_eq!(pixels, window.pixels().collect::<Vec<_>>());
+        assert!(tiles.clone().all(|area| window.has(area) && !area.has(window)));
+        assert!(!window.has(Area::whole(frame)) && Area::whole(frame).has(window));
+        assert!(!window.has(Area::whole(window.size())), "it is one of another frame");
     }
 
     #[test]

@@ -6,7 +6,7 @@ use rtfarm_core::{
     prepared::PreparedBytes,
     render::{Quality, Settings},
     scene::Scene,
-    tile::{Size, TileGrid},
+    tile::{Area, Crop, Size, TileGrid},
     transfer::Transfer,
 };
 use rtfarm_picture::PictureFormat;
@@ -23,6 +23,8 @@ pub struct RenderRequest {
     pub strict: bool,
     /// The frame; the size that the scene asks for when missing.
     pub size: Option<Size>,
+    /// The part of the frame that the picture shows; all of it when missing.
+    pub crop: Option<Crop>,
     /// How good the picture is to be.
     pub quality: Quality,
     /// The side of a tile in pixels; chosen by the frame's size when missing.
@@ -42,7 +44,7 @@ pub struct Order {
     pub prepared: PreparedBytes,
     /// What the picture depends on besides.
     pub settings: Settings,
-    /// The frame and its tiles.
+    /// The frame, what of it the picture shows, and its tiles.
     pub grid: TileGrid,
     /// What the numbers of colours said of light in the scene, and are to say in a PNG.
     pub transfer: Transfer,
@@ -88,14 +90,19 @@ impl RenderRequest {
         let viewport = scene.viewport.ok_or(PrepareError::NoViewport);
         let viewport = viewport.map_err(|error| other(error.to_string()))?;
         let size = self.size.or(scene.size_hint).unwrap_or_else(|| viewport.default_size());
+        let window = match self.crop {
+            Some(crop) => crop.of(size).map_err(|error| other(error.to_string()))?,
+            None => Area::whole(size),
+        };
         let grid = match self.tile_side {
-            Some(side) => TileGrid::new(size, side).map_err(|error| other(error.to_string()))?,
-            None => TileGrid::balanced(size),
+            Some(side) => TileGrid::new(window, side).map_err(|error| other(error.to_string()))?,
+            None => TileGrid::balanced(window),
         };
         if grid.count() > MOST_TILES {
             return Err(other(format!(
                 "a picture is cut into at most {MOST_TILES} tiles; {size} in tiles of {side}x{side} \
                  would be {count}",
+                size = window.size(),
                 side = grid.side(),
                 count = grid.count()
             )));
@@ -121,6 +128,7 @@ mod tests {
             name: "scene".to_owned(),
             strict: false,
             size: None,
+            crop: None,
             quality: Quality::default(),
             tile_side: None,
             transfer: Transfer::None,
@@ -140,6 +148,20 @@ mod tests {
         let wanted = RenderRequest { size: Some(size), ..request() };
         let order = place(wanted, VIEWPORT).order.unwrap();
         assert_eq!(order.settings.size, size);
+    }
+
+    #[test]
+    fn a_crop_window_is_a_part_of_the_frame() {
+        let crop = |corner, sides| Some(Crop { corner, sides });
+        let wanted = RenderRequest { crop: crop([60, 30], [4, 2]), ..request() };
+        let order = place(wanted, VIEWPORT).order.unwrap();
+        assert_eq!(order.settings.size, Size::new(64, 32).unwrap());
+        assert_eq!(Some(order.grid.window()), Area::new(order.settings.size, [60, 30], [4, 2]));
+        for crop in [crop([60, 30], [5, 2]), crop([0, 0], [0, 1]), crop([u32::MAX, 0], [1, 1])] {
+            let refused = place(RenderRequest { crop, ..request() }, VIEWPORT).order.unwrap_err();
+            let Refusal::Other(reason) = refused else { panic!("the scene is innocent") };
+            assert!(reason.contains("a frame of 64x32 pixels does not have"), "{reason}");
+        }
     }
 
     #[test]

@@ -7,4 +7,4 @@ mod picture;
 mod png;
 
 pub use format::PictureFormat;
-pub use picture::{Picture, PutError, check_pixels};
+pub use picture::{Picture, PutError, TilePixels, pixel_bytes};

@@ -1,7 +1,11 @@
 //! What the hash of a delivered tile covers.
 
 use prost::Message;
-use rtfarm_core::{prepared::SceneHash, render::Settings, tile::TileId};
+use rtfarm_core::{
+    prepared::SceneHash,
+    render::Settings,
+    tile::{TileGrid, TileId},
+};
 
 use crate::{JobId, wire};
 
@@ -16,12 +20,15 @@ pub struct TileHasher {
 }
 
 impl TileHasher {
-    /// Derives a job's key. `tile_side` is in pixels.
-    pub fn new(job: JobId, scene: SceneHash, settings: Settings, tile_side: u32) -> Self {
+    /// Derives a job's key.
+    pub fn new(job: JobId, scene: SceneHash, settings: Settings, grid: TileGrid) -> Self {
         let mut hasher = blake3::Hasher::new_derive_key(CONTEXT);
         hasher.update(&job.0.to_le_bytes());
         hasher.update(&scene.0);
-        hasher.update(&tile_side.to_le_bytes());
+        let window = grid.window();
+        for number in [grid.side(), window.x0(), window.y0(), window.width(), window.height()] {
+            hasher.update(&number.to_le_bytes());
+        }
         hasher.update(&wire::Settings::from(settings).encode_to_vec());
         Self { key: *hasher.finalize().as_bytes() }
     }
@@ -41,7 +48,7 @@ mod tests {
 
     use rtfarm_core::{
         render::Quality,
-        tile::{Size, TileGrid},
+        tile::{Area, Size},
     };
 
     use super::*;
@@ -55,8 +62,14 @@ mod tests {
         };
         let grid = TileGrid::new(size(64), 16).unwrap();
         let tile = |number| grid.tile(number).unwrap();
-        let hasher = |job, scene, settings, side| {
-            TileHasher::new(JobId(job), SceneHash([scene; 32]), settings, side)
+        let hasher = |job, scene, settings: Settings, side| {
+            let grid = TileGrid::new(settings.size, side).unwrap();
+            TileHasher::new(JobId(job), SceneHash([scene; 32]), settings, grid)
+        };
+        let cropped = |corner| {
+            let window = Area::new(size(64), corner, [32, 32]).unwrap();
+            let grid = TileGrid::new(window, 16).unwrap();
+            TileHasher::new(JobId(1), SceneHash([1; 32]), settings(64, 0), grid)
         };
         let ours = || hasher(1, 1, settings(64, 0), 16);
         assert_eq!(ours().hash(tile(3), b"same"), ours().hash(tile(3), b"same"));
@@ -69,7 +82,10 @@ mod tests {
             hasher(1, 1, settings(65, 0), 16).hash(tile(3), b"same"),
             hasher(1, 1, settings(64, 1), 16).hash(tile(3), b"same"),
             hasher(1, 1, settings(64, 0), 17).hash(tile(3), b"same"),
+            cropped([0, 0]).hash(tile(3), b"same"),
+            cropped([16, 0]).hash(tile(3), b"same"),
+            cropped([0, 16]).hash(tile(3), b"same"),
         ]);
-        assert_eq!(hashes.len(), 8);
+        assert_eq!(hashes.len(), 11);
     }
 }

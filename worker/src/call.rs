@@ -25,8 +25,8 @@ pub(crate) enum Call {
     Lease { member: Membership, most_tiles: usize, wait: Duration },
     /// Proves progress under leases.
     Renew { member: Membership, renewals: Vec<Renewal> },
-    /// Brings a tile.
-    Deliver { member: Membership, tile: Delivery },
+    /// Brings tiles.
+    Deliver { member: Membership, tiles: Vec<Delivery> },
     /// Gives every lease back.
     Leave { member: Membership, reason: String },
 }

@@ -84,10 +84,14 @@ pub(crate) async fn ask(
             let lost = renewed.into_inner().lost.into_iter().map(Into::into).collect();
             Ok(Answer::Renewed { lost })
         }
-        Call::Deliver { member, tile } => {
-            let number = tile.tile.number();
-            let delivered = client.deliver(write_delivery(member, tile)).await?.into_inner();
-            tracing::debug!(tile = number, verdict = ?delivered.verdict(), "delivered");
+        Call::Deliver { member, tiles } => {
+            let request = wire::DeliverRequest {
+                worker: member.worker.0,
+                incarnation: member.incarnation.0,
+                tiles: tiles.into_iter().map(write_tile).collect(),
+            };
+            let delivered = client.deliver(request).await?.into_inner();
+            tracing::debug!(verdicts = ?delivered.verdicts, "delivered");
             Ok(Answer::Delivered)
         }
         Call::Leave { member, reason } => {
@@ -98,16 +102,15 @@ pub(crate) async fn ask(
     }
 }
 
-fn write_delivery(member: Membership, delivery: Delivery) -> wire::DeliverRequest {
-    wire::DeliverRequest {
-        worker: member.worker.0,
-        incarnation: member.incarnation.0,
-        lease: Some(delivery.lease.into()),
-        tile: delivery.tile.number(),
-        pixels: delivery.pixels,
-        hash: delivery.hash.to_vec().into(),
-        seconds: delivery.seconds,
-        tally: Some(delivery.tally.into()),
+fn write_tile(tile: Delivery) -> wire::FinishedTile {
+    let Delivery { lease, tile, pixels, hash, tally, seconds } = tile;
+    wire::FinishedTile {
+        lease: Some(lease.into()),
+        tile: tile.number(),
+        pixels,
+        hash: hash.to_vec().into(),
+        seconds,
+        tally: Some(tally.into()),
     }
 }
 

@@ -5,7 +5,7 @@ use std::{path::Path, sync::Arc};
 use rtfarm_core::{
     prepared::SceneHash,
     render::Settings,
-    tile::{TileGrid, TileSideError},
+    tile::{Crop, TileGrid, TileSideError},
 };
 use rtfarm_proto::{Incarnation, JobId, TileHasher, WireError, scene_hash, wire};
 
@@ -42,14 +42,17 @@ impl Job {
     ) -> Result<Self, JobError> {
         let settings: Settings = job.settings.ok_or(WireError::Missing("settings"))?.try_into()?;
         let scene = scene_hash(&job.scene_hash)?;
+        let window = Crop::from(job.window.ok_or(WireError::Missing("window"))?);
+        let window = window.of(settings.size).map_err(WireError::from)?;
+        let grid = TileGrid::new(window, job.tile_side.into())?;
         Ok(Self {
             incarnation,
             scene,
             scene_byte_count: job.scene_bytes,
             scene_path: (!job.scene_path.is_empty()).then(|| Path::new(&job.scene_path).into()),
             settings,
-            grid: TileGrid::new(settings.size, job.tile_side.into())?,
-            hasher: TileHasher::new(id, scene, settings, job.tile_side),
+            grid,
+            hasher: TileHasher::new(id, scene, settings, grid),
         })
     }
 }

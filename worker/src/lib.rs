@@ -10,6 +10,7 @@ mod config;
 mod error;
 mod job;
 mod map;
+mod outbox;
 mod parent;
 mod pulse;
 mod reference;

@@ -36,12 +36,12 @@ pub fn reference(isa: Isa) -> [u8; 32] {
     let settings = Settings { size, quality: Quality { sampling, ..Quality::default() } };
     let grid = TileGrid::new(size, FRAME.0).expect("it is in range");
     let tile = grid.tile(0).expect("there is one");
-    let hasher = TileHasher::new(JobId(0), prepared.hash(), settings, grid.side());
+    let hasher = TileHasher::new(JobId(0), prepared.hash(), settings, grid);
 
     let scene = PreparedScene::open(prepared).expect("it was prepared here");
     let mut go_on = || ControlFlow::Continue(());
     let rendered = render_tile(&scene, &settings.quality, grid.area(tile), isa, &mut go_on);
-    hasher.hash(tile, &pixels_to_bytes(&rendered.expect("nobody stops it").pixels))
+    hasher.hash(tile, &pixels_to_bytes(rendered.expect("nobody stops it").pixels))
 }
 
 #[cfg(test)]

@@ -148,14 +148,15 @@ mod tests {
     async fn load_from(path: &Path, is_local: bool) -> Result<Arc<Scene>, SceneError> {
         let size = Size::new(16, 16).unwrap();
         let settings = Settings { size, quality: Quality::default() };
+        let grid = TileGrid::new(size, 16).unwrap();
         let job = Job {
             incarnation: Incarnation(1),
             scene: SceneHash([0; 32]),
             scene_byte_count: 1,
             scene_path: Some(path.into()),
             settings,
-            grid: TileGrid::new(size, 16).unwrap(),
-            hasher: TileHasher::new(JobId(1), SceneHash([0; 32]), settings, 16),
+            grid,
+            hasher: TileHasher::new(JobId(1), SceneHash([0; 32]), settings, grid),
         };
         let nowhere = Address::Tcp("127.0.0.1:1".to_owned()).to_string();
         let client = FarmClient::new(Endpoint::from_shared(nowhere).unwrap().connect_lazy());

@@ -19,7 +19,7 @@ use crate::{
 
 /// Something that was begun and will report back once. Numbers are never given twice, so that a
 /// report that comes too late is known.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub(crate) struct TaskId(u64);
 
 /// What the shell is to do.

@@ -10,32 +10,35 @@ use std::{
 };
 
 use rtfarm_core::{prepared::SceneHash, tile::TileId};
-use rtfarm_proto::{Address, LONGEST_WAIT, LeaseName, Renewal};
+use rtfarm_proto::{Address, DELIVERY_BYTES, LONGEST_WAIT, LeaseName, Renewal};
 
 use crate::{
     call::{Answer, Call, CallError, CallErrorKind, Delivery, Membership, Next, Run},
     config::Config,
     error::WorkerError,
     job::Job,
+    outbox::{Rendered, TURN},
     pulse::Object,
     scene::SceneError,
     task::{Action, GivenUp, TaskId, Tasks},
 };
 
-/// Tiles that a thread may have before it, so that it never waits for the network. As many may
-/// be on their way to the coordinator.
-const TILES_AHEAD: usize = 2;
+/// Turns of tiles that a thread may have before it, so that it never waits for the network. As many
+/// may be on their way to the coordinator. A turn is a tile, or as many small ones as take a thread
+/// [`TURN`].
+const TURNS_AHEAD: usize = 2;
 
-/// Tiles that are handed to the threads at once, for each of them: the one that it renders and
+/// Turns that are handed to the threads at once, for each of them: the one that it renders and
 /// those before it.
-const TILES_AT_HAND: usize = 1 + TILES_AHEAD;
+const TURNS_AT_HAND: usize = 1 + TURNS_AHEAD;
 
-/// The most tiles whose pixels may be in memory or in the making, for each thread: a coordinator
+/// The most turns whose pixels may be in memory or in the making, for each thread: a coordinator
 /// that takes pixels slowly stops the threads.
-const MOST_TILES_OF_PIXELS: usize = TILES_AT_HAND + TILES_AHEAD;
+const MOST_TURNS_OF_PIXELS: usize = TURNS_AT_HAND + TURNS_AHEAD;
 
-/// The longest run that is asked for, in tiles a thread.
+/// The longest run that is asked for, for each thread: so many tiles, or so many turns of small ones.
 const LONGEST_RUN_A_THREAD: usize = 32;
+const LONGEST_RUN_IN_TURNS: usize = 16;
 
 /// Progress is told so many times before a lease would run out.
 const BEATS_A_TERM: u32 = 4;
@@ -77,6 +80,8 @@ struct Member {
     scenes: Vec<SceneHash>,
     /// Tiles that wait for a thread, first come first served.
     waiting: VecDeque<Waiting>,
+    /// The turn of a thread, in tiles: at least one.
+    turn: usize,
     /// Tiles in the hands of the threads.
     rendering_count: usize,
     /// Tiles that wait to be delivered.
@@ -134,9 +139,7 @@ impl Worker {
 
     /// Event: the coordinator has answered a call.
     pub(crate) fn on_answer(&mut self, task: TaskId, answer: Answer, now: Instant) {
-        if self.tasks.on_answer(task).is_none() {
-            return;
-        }
+        let Some(call) = self.tasks.on_answer(task) else { return };
         match (&mut self.stage, answer) {
             (Stage::Joining, Answer::Connected) => self.tasks.call(Call::Join, now),
             (Stage::Joining, Answer::Joined { member, farm, term }) => {
@@ -160,7 +163,11 @@ impl Worker {
                 member.is_renewing = false;
                 member.on_leases_lost(&lost, &mut self.tasks);
             }
-            (Stage::Working(member), Answer::Delivered) => member.delivering_count -= 1,
+            (Stage::Working(member), Answer::Delivered) => {
+                if let Call::Deliver { tiles, .. } = call {
+                    member.delivering_count -= tiles.len();
+                }
+            }
             (Stage::Leaving(_), Answer::Left) => self.end_as_left(),
             (stage, answer) => unreachable!("{answer:?} was not asked for while {stage:?}"),
         }
@@ -201,14 +208,12 @@ impl Worker {
         }
     }
 
-    /// Event: a thread is done with a tile; it has no pixels if it was stopped.
-    pub(crate) fn on_tile_rendered(&mut self, task: TaskId, tile: Option<Delivery>, now: Instant) {
-        if self.tasks.on_end(task)
-            && let Stage::Working(member) = &mut self.stage
-        {
-            member.rendering_count -= 1;
-            // The pixels are welcome even if the lease was lost meanwhile.
-            member.rendered.extend(tile);
+    /// Event: threads are done with tiles; one has no pixels if it was stopped.
+    pub(crate) fn on_tiles_rendered(&mut self, rendered: Vec<Rendered>, now: Instant) {
+        let awaited = rendered.into_iter().filter(|&(task, _)| self.tasks.on_end(task));
+        let awaited: Vec<Option<Delivery>> = awaited.map(|(_, tile)| tile).collect();
+        if let Stage::Working(member) = &mut self.stage {
+            member.on_rendered(awaited);
             self.proceed(now);
         }
     }
@@ -332,6 +337,7 @@ impl Member {
             fetching: None,
             scenes: Vec::new(),
             waiting: VecDeque::new(),
+            turn: 1,
             rendering_count: 0,
             rendered: VecDeque::new(),
             delivering_count: 0,
@@ -381,14 +387,50 @@ impl Member {
         }
     }
 
+    fn on_rendered(&mut self, tiles: Vec<Option<Delivery>>) {
+        self.rendering_count -= tiles.len();
+        // The pixels are welcome even if the lease was lost meanwhile.
+        let tiles: Vec<Delivery> = tiles.into_iter().flatten().collect();
+        if tiles.is_empty() {
+            return;
+        }
+        let (seconds, bytes) = tiles.iter().fold((0.0, 0), |(seconds, bytes), tile| {
+            (seconds + tile.seconds, bytes + tile.pixels.len())
+        });
+        let in_time = TURN.as_secs_f64() * tiles.len() as f64 / seconds;
+        let in_a_message = DELIVERY_BYTES * tiles.len() / bytes.max(1);
+        self.turn = (in_time as usize).min(in_a_message).max(1);
+        self.rendered.extend(tiles);
+    }
+
+    /// The next tiles to be delivered, as many as a message may hold; none while enough are on their
+    /// way.
+    fn next_delivery(&mut self) -> Vec<Delivery> {
+        let (mut tiles, mut bytes) = (Vec::<Delivery>::new(), 0);
+        while self.delivering_count + tiles.len() < TURNS_AHEAD * self.turn * self.threads
+            && let Some(tile) = self.rendered.front()
+        {
+            bytes += tile.pixels.len();
+            if bytes > DELIVERY_BYTES && !tiles.is_empty() {
+                break;
+            }
+            tiles.extend(self.rendered.pop_front());
+        }
+        for tile in &tiles {
+            self.on_tile_sent(tile.lease, tile.tile);
+        }
+        self.delivering_count += tiles.len();
+        tiles
+    }
+
     /// Begins whatever can be begun now; when it `is_draining`, deliveries alone.
     fn proceed(&mut self, is_draining: bool, tasks: &mut Tasks, now: Instant) {
-        while self.delivering_count < TILES_AHEAD * self.threads
-            && let Some(tile) = self.rendered.pop_front()
-        {
-            self.on_tile_sent(tile.lease, tile.tile);
-            self.delivering_count += 1;
-            tasks.call(Call::Deliver { member: self.id, tile }, now);
+        loop {
+            let tiles = self.next_delivery();
+            if tiles.is_empty() {
+                break;
+            }
+            tasks.call(Call::Deliver { member: self.id, tiles }, now);
         }
         if is_draining {
             self.waiting.clear();
@@ -402,10 +444,11 @@ impl Member {
         self.forget_scenes(tasks);
 
         let tiles_left: usize = self.leases.values().map(|held| held.tiles_left).sum();
-        let is_short = tiles_left < TILES_AHEAD * self.threads;
+        let is_short = tiles_left < TURNS_AHEAD * self.turn * self.threads;
         if is_short && !is_draining && !self.is_leasing && self.fetching.is_none() {
             self.is_leasing = true;
-            let most_tiles = LONGEST_RUN_A_THREAD * self.threads;
+            let longest = LONGEST_RUN_A_THREAD.max(LONGEST_RUN_IN_TURNS * self.turn);
+            let most_tiles = longest * self.threads;
             tasks.call(Call::Lease { member: self.id, most_tiles, wait: LONGEST_WAIT }, now);
         }
         let has_news = self.leases.values().any(|held| held.has_news);
@@ -427,8 +470,8 @@ impl Member {
 
     fn has_room_for_pixels(&self) -> bool {
         let pixels = self.rendering_count + self.rendered.len() + self.delivering_count;
-        self.rendering_count < TILES_AT_HAND * self.threads
-            && pixels < MOST_TILES_OF_PIXELS * self.threads
+        let turns = self.turn * self.threads;
+        self.rendering_count < TURNS_AT_HAND * turns && pixels < MOST_TURNS_OF_PIXELS * turns
     }
 
     fn on_tile_sent(&mut self, name: LeaseName, tile: TileId) {

@@ -16,6 +16,7 @@ mod flat;
 mod hierarchy;
 mod lights;
 pub(crate) mod mip_maps;
+mod near_planes;
 mod newell;
 mod parallelepiped;
 mod place;
@@ -63,7 +64,7 @@ pub fn prepare_with(
 
     let scaled = Collected::new(scene, &ranks).scale(extent_of_eye_and_lights(scene, &viewport));
     let scale = scaled.scale;
-    let surfaces = scaled.weld().share_surfaces();
+    let surfaces = scaled.weld().share_surfaces(&ranks);
     let Hierarchy { frame, nodes, order } = Hierarchy::new(&surfaces);
     let mut faces = surfaces.sort(&order);
     drop(order);

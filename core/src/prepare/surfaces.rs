@@ -4,6 +4,7 @@ use super::{
     equal_spheres::share_spheres,
     flat::FlatFaces,
     planes::{SharedPlanes, share_planes},
+    ranks::Ranks,
     solid_trees::SolidTrees,
     weld::Welded,
 };
@@ -32,10 +33,10 @@ pub(super) struct Surfaces {
 
 impl Welded {
     /// Finds the surfaces that faces share.
-    pub(super) fn share_surfaces(self) -> Surfaces {
+    pub(super) fn share_surfaces(self, ranks: &Ranks) -> Surfaces {
         let Self { flat, mut spheres, solids, first_corners } = self;
         let SharedPlanes { of_triangles, of_quadrangles, of_boxes, planes } =
-            share_planes(&flat, &first_corners);
+            share_planes(&flat, ranks, &first_corners);
         let sphere_surfaces = share_spheres(&mut spheres, &solids);
         let SolidTrees { solids, bounds, nodes, leaves } = solids;
         let mut of_boxes = of_boxes.into_iter();

@@ -40,7 +40,7 @@ fn job(scene: u8) -> Arc<Job> {
         scene_path: None,
         settings,
         grid: grid(),
-        hasher: TileHasher::new(JobId(1), SceneHash([scene; 32]), settings, 16),
+        hasher: TileHasher::new(JobId(1), SceneHash([scene; 32]), settings, grid()),
     })
 }
 
@@ -52,7 +52,7 @@ fn run(number: u64, count: u32, scene: u8) -> Answer {
 
 fn delivery(lease: LeaseName, tile: TileId) -> Delivery {
     let pixels = tile.number().to_le_bytes().to_vec().into();
-    Delivery { lease, tile, pixels, hash: [0; 32], tally: Tally::default(), seconds: 0.0 }
+    Delivery { lease, tile, pixels, hash: [0; 32], tally: Tally::default(), seconds: 1.0 }
 }
 
 fn no_answer() -> CallError {
@@ -171,15 +171,31 @@ impl Bench {
             }
         }
         let at_hand = self.renderings.len() - self.stopped.len();
-        assert!(at_hand <= TILES_AT_HAND * self.threads, "{at_hand} tiles at hand");
+        let turn = self.turn();
+        assert!(at_hand <= TURNS_AT_HAND * turn * self.threads, "{at_hand} tiles at hand");
         let delivering = self.calls.values().filter(|call| is_deliver(call)).count();
-        assert!(delivering <= TILES_AHEAD * self.threads, "{delivering} tiles on their way");
+        assert!(delivering <= TURNS_AHEAD * self.threads, "{delivering} messages on their way");
         let deadline = self.worker.wake_at();
         assert!(self.calls.is_empty() || deadline.is_some(), "no call waits for ever");
         if self.exit.is_some() {
             assert!(self.calls.is_empty() && self.fetches.is_empty(), "nothing goes on");
             assert_eq!(self.renderings.len(), self.stopped.len(), "nothing goes on");
         }
+    }
+
+    /// The turn of a thread, in tiles.
+    fn turn(&self) -> usize {
+        if let Stage::Working(member) = &self.worker.stage { member.turn } else { 1 }
+    }
+
+    /// Tiles whose pixels are in memory or in the making.
+    fn pixels(&self) -> usize {
+        let delivered = self.calls.values().map(|call| match call {
+            Call::Deliver { tiles, .. } => tiles.len(),
+            _ => 0,
+        });
+        let Stage::Working(member) = &self.worker.stage else { panic!("it does not work") };
+        delivered.sum::<usize>() + member.rendered.len() + self.renderings.len()
     }
 
     fn find(&self, is_it: impl Fn(&Call) -> bool) -> TaskId {
@@ -225,7 +241,7 @@ impl Bench {
         let (&task, &(lease, tile)) = self.renderings.first_key_value().expect("a rendering");
         self.renderings.remove(&task);
         let pixels = (!self.stopped.remove(&task)).then(|| delivery(lease, tile));
-        self.worker.on_tile_rendered(task, pixels, self.now);
+        self.worker.on_tiles_rendered(vec![(task, pixels)], self.now);
         self.absorb();
         (lease, tile)
     }
@@ -268,7 +284,7 @@ fn a_tile_goes_from_its_lease_to_its_delivery() {
     assert!(bench.has(is_lease), "one tile is too few to go on with");
     let (name, tile) = bench.render();
     let delivered = bench.answer(is_deliver, Answer::Delivered);
-    assert_eq!(delivered, Call::Deliver { member, tile: delivery(name, tile) });
+    assert_eq!(delivered, Call::Deliver { member, tiles: vec![delivery(name, tile)] });
     assert!(!bench.has(is_deliver));
 }
 
@@ -278,7 +294,7 @@ fn tiles_are_asked_for_before_the_threads_run_dry() {
     for left in (0..9).rev() {
         bench.render();
         bench.answer(is_deliver, Answer::Delivered);
-        assert_eq!(bench.has(is_lease), left < TILES_AHEAD * 2, "{left} tiles left");
+        assert_eq!(bench.has(is_lease), left < TURNS_AHEAD * 2, "{left} tiles left");
     }
 }
 
@@ -303,17 +319,64 @@ fn slow_deliveries_stop_the_threads_and_the_asking() {
         bench.render();
         rendered += 1;
     }
-    assert_eq!(rendered, MOST_TILES_OF_PIXELS);
+    assert_eq!(rendered, MOST_TURNS_OF_PIXELS);
     assert!(!bench.has(is_lease));
     bench.answer(is_deliver, Answer::Delivered);
     assert_eq!(bench.renderings.len(), 1, "one out, one in");
 }
 
 #[test]
+fn small_tiles_are_handed_on_and_delivered_together() {
+    let mut bench = Bench::rendering(1, 100);
+    let rendered = |bench: &mut Bench, count: usize| -> Vec<Delivery> {
+        let begun: Vec<_> = (0..count).filter_map(|_| bench.renderings.pop_first()).collect();
+        let small = |&(_, (lease, tile))| Delivery {
+            seconds: TURN.as_secs_f64() / 4.5,
+            ..delivery(lease, tile)
+        };
+        let tiles: Vec<Delivery> = begun.iter().map(small).collect();
+        let rendered =
+            begun.iter().zip(&tiles).map(|(&(task, _), tile)| (task, Some(tile.clone())));
+        bench.worker.on_tiles_rendered(rendered.collect(), bench.now);
+        tiles
+    };
+    let first = rendered(&mut bench, 1);
+    assert_eq!(bench.turn(), 4);
+    bench.absorb();
+    assert_eq!(bench.renderings.len(), 4 * TURNS_AT_HAND);
+    let more = rendered(&mut bench, 7);
+    bench.absorb();
+    for tiles in [first, more] {
+        let expected = Call::Deliver { member: member(1), tiles };
+        assert_eq!(bench.answer(is_deliver, Answer::Delivered), expected);
+    }
+    while !bench.renderings.is_empty() {
+        rendered(&mut bench, 4);
+        bench.absorb();
+    }
+    assert_eq!(bench.pixels(), 4 * MOST_TURNS_OF_PIXELS, "slow deliveries stop the threads");
+}
+
+#[test]
+fn a_message_holds_so_many_bytes_and_no_more() {
+    let mut bench = Bench::rendering(1, 3);
+    let big = |(lease, tile)| Delivery {
+        pixels: vec![0; DELIVERY_BYTES / 2].into(),
+        ..delivery(lease, tile)
+    };
+    let begun = std::mem::take(&mut bench.renderings);
+    let rendered = begun.into_iter().map(|(task, tile)| (task, Some(big(tile))));
+    bench.worker.on_tiles_rendered(rendered.collect(), bench.now);
+    bench.absorb();
+    let Call::Deliver { tiles, .. } = bench.answer(is_deliver, Answer::Delivered) else { panic!() };
+    assert_eq!(tiles.len(), 2);
+}
+
+#[test]
 fn pixels_are_kept_until_they_are_acknowledged() {
     let mut bench = Bench::rendering(1, 1);
     let (name, tile) = bench.render();
-    let expected = Call::Deliver { member: member(1), tile: delivery(name, tile) };
+    let expected = Call::Deliver { member: member(1), tiles: vec![delivery(name, tile)] };
     for _ in 0..5 {
         assert_eq!(bench.fail(is_deliver, no_answer()), expected);
         assert!(!bench.has(is_deliver), "not at once");
@@ -369,12 +432,12 @@ fn a_lost_lease_is_rendered_no_further_but_its_pixels_are_delivered() {
     let (name, tile) = bench.render();
     bench.beat(1);
     bench.answer(is_renew, Answer::Renewed { lost: vec![lease(1)] });
-    assert_eq!(bench.stopped.len(), TILES_AT_HAND);
+    assert_eq!(bench.stopped.len(), TURNS_AT_HAND);
     while !bench.renderings.is_empty() {
         bench.render();
     }
     let delivered = bench.answer(is_deliver, Answer::Delivered);
-    assert_eq!(delivered, Call::Deliver { member: member(1), tile: delivery(name, tile) });
+    assert_eq!(delivered, Call::Deliver { member: member(1), tiles: vec![delivery(name, tile)] });
     assert!(!bench.has(is_deliver) && bench.has(is_lease));
 }
 
@@ -637,7 +700,7 @@ fn a_worker_that_is_drained_delivers_what_its_threads_have_and_leaves() {
         count += 1;
         bench.answer(is_deliver, Answer::Delivered);
     }
-    assert_eq!(count, TILES_AT_HAND, "no tile is begun any more");
+    assert_eq!(count, TURNS_AT_HAND, "no tile is begun any more");
     bench.answer(|call| matches!(call, Call::Leave { .. }), Answer::Left);
     assert_eq!(bench.exit, Some(Ok(())));
 }
@@ -752,10 +815,12 @@ impl Chance {
                 let lost = leases.into_iter().filter(|name| !known.contains_key(name)).collect();
                 Ok(Answer::Renewed { lost })
             }
-            Call::Deliver { tile, .. } => {
-                if let Some((scene, tiles)) = self.leases.get_mut(&tile.lease) {
-                    tiles.remove(&tile.tile);
-                    self.delivered.insert((*scene, tile.tile));
+            Call::Deliver { tiles, .. } => {
+                for tile in tiles {
+                    if let Some((scene, tiles)) = self.leases.get_mut(&tile.lease) {
+                        tiles.remove(&tile.tile);
+                        self.delivered.insert((*scene, tile.tile));
+                    }
                 }
                 Ok(Answer::Delivered)
             }
@@ -860,7 +925,7 @@ fn simulate(seed: u64) {
             Letter::Rendered(task) => {
                 let (lease, tile) = bench.renderings.remove(&task).unwrap();
                 let pixels = (!bench.stopped.remove(&task)).then(|| delivery(lease, tile));
-                bench.worker.on_tile_rendered(task, pixels, bench.now);
+                bench.worker.on_tiles_rendered(vec![(task, pixels)], bench.now);
             }
             Letter::Beat(lease) => {
                 bench.worker.on_beat(&BTreeMap::from([((lease, None), 1)]), bench.now);

@@ -1,6 +1,8 @@
 //! The whole farm as processes: the same bytes whoever renders them and whatever befalls them,
 //! logs that count, nothing left behind.
 
+mod faults;
+
 use std::{
     collections::BTreeSet,
     fs::{self, File},
@@ -100,7 +102,14 @@ impl Place {
 
     /// Starts the program; what it says to standard error goes to the file `log`.
     fn start(&self, log: &str, args: &[&str]) -> Process {
-        let mut child = Command::new(env!("CARGO_BIN_EXE_rtfarm"))
+        self.start_by(&[], log, args)
+    }
+
+    /// Starts it by a command that becomes it.
+    fn start_by(&self, starter: &[String], log: &str, args: &[&str]) -> Process {
+        let mut words = starter.iter().map(String::as_str).chain([env!("CARGO_BIN_EXE_rtfarm")]);
+        let mut child = Command::new(words.next().expect("the program's own name"))
+            .args(words)
             .args(args)
             .current_dir(self.folder.path())
             .env("TMPDIR", self.path("tmp"))
@@ -252,6 +261,25 @@ fn pictures_do_not_depend_on_workers_threads_and_tiles() {
 }
 
 #[test]
+fn a_crop_window_shows_those_pixels_of_the_whole_picture() {
+    let place = Place::new();
+    let decode = |bytes: &[u8]| image::load_from_memory(bytes).unwrap().into_rgb16();
+    let common = ["--size", "101x67", "--depth", "16", "--error", "0.02", "--workers"];
+    let whole = decode(&place.render("out.png", &[&common[..], &["2"]].concat()));
+    for (crop, [x, y, width, height]) in
+        [("17,5,40,33", [17, 5, 40, 33]), ("100,66,1,1", [100, 66, 1, 1])]
+    {
+        let expected = image::imageops::crop_imm(&whole, x, y, width, height).to_image();
+        for workers in ["0", "2"] {
+            let args = [&common[..], &[workers, "--tile", "16", "--crop", crop]].concat();
+            let found = decode(&place.render("out.png", &args));
+            assert!(found == expected, "{crop} with {workers} workers");
+        }
+    }
+    place.check_nothing_is_left();
+}
+
+#[test]
 fn a_picture_in_a_given_time_can_be_had_again() {
     let place = Place::new();
     let common = ["--size", "64x48", "--workers", "0", "--threads", "1"];
@@ -346,7 +374,16 @@ fn a_farm_over_tcp_gives_the_same_bytes() {
     let mut workers = [place.start("worker-a.log", &worker), place.start("worker-b.log", &worker)];
     for output in ["farm.png", "farm.exr"] {
         let pictures = ["none", "srgb"].map(|transfer| {
-            let picture = ["--size", "103x59", "--samples", "2", "--transfer", transfer];
+            let picture = [
+                "--size",
+                "103x59",
+                "--crop",
+                "3,5,99,50",
+                "--samples",
+                "2",
+                "--transfer",
+                transfer,
+            ];
             let args = [&["submit", "scene.rt", "-o", output, "--coordinator", url], &picture[..]];
             let mut submit = place.start("submit.log", &args.concat());
             assert!(submit.wait().success(), "{}", submit.log());
@@ -526,6 +563,8 @@ fn bad_input_gives_one_clear_line_and_an_exit_code() {
         ("scene.rt", "o.png", "--size=0x0", 2, "not 0x0"),
         ("scene.rt", "o.png", "--size=100000x100000", 2, "not 100000x100000"),
         ("scene.rt", "o.png", "--size=1e3x5", 2, "a size looks like 1280x720"),
+        ("scene.rt", "o.png", "--crop=1,2,3", 2, "a crop window looks like 320,180,640,360"),
+        ("scene.rt", "o.png", "--crop=0,0,9999,1", 2, "does not have all of the crop window"),
         ("scene.rt", "o.png", "--tile=2", 2, "2 is not in 4..=1024"),
         ("scene.rt", "o.png", "--samples=0", 2, "must be a whole number from 1 to 65536"),
         ("scene.rt", "o.png", "--error=0", 2, "must be a number above 0 and at most 1"),
@@ -573,12 +612,12 @@ fn start_coordinator(place: &Place) -> (Process, String) {
     (coordinator, url)
 }
 
-/// Does `check` with a small disk at `disk` in the place; the disk is unmounted by the end.
-fn with_small_disk(place: &Place, check: impl FnOnce() + std::panic::UnwindSafe) {
+/// Does `check` with a disk of that size at `disk` in the place; the disk is unmounted by the end.
+fn with_small_disk(place: &Place, size: &str, check: impl FnOnce()) {
     let disk = place.path("disk");
     fs::create_dir(&disk).unwrap();
     let mounted = Command::new("mount")
-        .args(["-t", "tmpfs", "-o", "size=64k", "none"])
+        .args(["-t", "tmpfs", "-o", &format!("size={size}"), "none"])
         .arg(&disk)
         .output()
         .is_ok_and(|output| output.status.success());
@@ -586,7 +625,7 @@ fn with_small_disk(place: &Place, check: impl FnOnce() + std::panic::UnwindSafe)
         eprintln!("SKIPPED: only root can mount the small disk that this test fills");
         return;
     }
-    let checked = std::panic::catch_unwind(check);
+    let checked = std::panic::catch_unwind(std::panic::AssertUnwindSafe(check));
     assert!(Command::new("umount").arg(&disk).status().unwrap().success());
     checked.unwrap();
 }
@@ -594,7 +633,7 @@ fn with_small_disk(place: &Place, check: impl FnOnce() + std::panic::UnwindSafe)
 #[test]
 fn a_full_disk_is_told_at_once() {
     let place = Place::new();
-    with_small_disk(&place, || {
+    with_small_disk(&place, "64k", || {
         for workers in ["0", "2"] {
             let size = ["--size", "512x512", "--samples", "1", "--workers", workers];
             let args = [&["render", "scene.rt", "-o", "disk/out.png"], &size[..]].concat();
@@ -611,7 +650,7 @@ fn a_picture_for_which_there_is_no_room_is_fetched_again() {
     let (_coordinator, url) = start_coordinator(&place);
     let _worker = place.start("worker.log", &["worker", "--threads", "1", "--coordinator", &url]);
     let picture = ["--size", "256x256", "--samples", "1"];
-    with_small_disk(&place, || {
+    with_small_disk(&place, "64k", || {
         let args = ["submit", "scene.rt", "-o", "disk/out.exr", "--coordinator", &url];
         let mut submit = place.start("submit.log", &[&args[..], &picture].concat());
         assert_eq!(submit.wait().code(), Some(1));
