@@ -8,10 +8,13 @@ use std::{
 
 use anyhow::{Context, anyhow};
 use rtfarm_coordinator::{Config, Coordinator, Listener};
+use rtfarm_core::isa::Isa;
 use tokio::net::{TcpListener, lookup_host};
 use tokio_util::sync::CancellationToken;
 
-use crate::{VERSION, args::CoordinatorArgs, failure::Failure, private_folder::PrivateFolder};
+use crate::{
+    BUILD, VERSION, args::CoordinatorArgs, failure::Failure, private_folder::PrivateFolder,
+};
 
 /// A client that sends nothing of its scene for this long is given up.
 pub(crate) const UPLOAD_SILENCE: Duration = Duration::from_secs(30);
@@ -40,6 +43,8 @@ pub(crate) async fn run(
 
     let coordinator = Coordinator::new(Config {
         version: VERSION.to_owned(),
+        build: BUILD.to_owned(),
+        reference: Some(rtfarm_worker::reference(Isa::fastest())),
         term: args.lease_seconds,
         audit: args.audit,
         upload_silence: UPLOAD_SILENCE,

@@ -36,6 +36,9 @@ use crate::{
 /// The version that both ends of a farm must have.
 const VERSION: &str = env!("CARGO_PKG_VERSION");
 
+/// Of the sources that pixels depend on, which coordinator and workers must share; see `build.rs`.
+const BUILD: &str = env!("RTFARM_BUILD");
+
 fn main() -> ExitCode {
     let args = match Args::try_parse() {
         Ok(args) => args,

@@ -21,7 +21,7 @@ use tokio::{net::UnixListener, sync::watch, task::spawn_blocking, time::Instant}
 use tokio_util::sync::CancellationToken;
 
 use crate::{
-    VERSION,
+    BUILD, VERSION,
     args::{PictureArgs, RenderArgs},
     children::{Children, Setup},
     console::Console,
@@ -231,8 +231,10 @@ async fn render_with_workers(
         .with_context(|| format!("cannot listen on {}", socket.display()))?;
     let coordinator = Coordinator::new(Config {
         version: VERSION.to_owned(),
-        term: args.lease_seconds,
+        build: BUILD.to_owned(),
         // The workers are this very program on this machine: nobody here has a reason to lie.
+        reference: None,
+        term: args.lease_seconds,
         audit: 0.0,
         upload_silence: UPLOAD_SILENCE,
         scene_folder: folder.path().to_owned(),

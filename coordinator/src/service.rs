@@ -40,7 +40,7 @@ use crate::{
     job::Job,
     lease::Run,
     members::{NoMember, Process},
-    shell::Shell,
+    shell::{Config, Shell},
     tiles::PixelHash,
 };
 
@@ -81,9 +81,10 @@ impl farm_server::Farm for FarmService {
         &self,
         request: Request<wire::JoinRequest>,
     ) -> Result<Response<wire::JoinResponse>, Status> {
-        let wire::JoinRequest { version, protocol, nonce, threads, isa, host, process } =
-            request.into_inner();
-        check_version("worker", &version, protocol, &self.shell)?;
+        let request = request.into_inner();
+        check_version("worker", &request.version, request.protocol, &self.shell)?;
+        check_pixels_of(&request, &self.shell)?;
+        let wire::JoinRequest { nonce, threads, isa, host, process, .. } = request;
         let threads = threads as usize;
         let worker = self.shell.join(Process { nonce, number: process, threads, host, isa });
         let worker = worker.map_err(|error| Status::failed_precondition(error.to_string()))?;
@@ -519,6 +520,29 @@ fn check_version(who: &str, version: &str, protocol: u32, shell: &Shell) -> Resu
         "this {who} is rtfarm {version} (protocol {protocol}), the coordinator is rtfarm {ours} \
          (protocol {PROTOCOL}); both must be the same"
     )))
+}
+
+/// Refuses a worker whose pixels would be others than the coordinator's workers' should be.
+fn check_pixels_of(request: &wire::JoinRequest, shell: &Shell) -> Result<(), Status> {
+    let wire::JoinRequest { host, isa, build, reference, .. } = request;
+    let Config { build: our_build, reference: ours, .. } = &shell.config;
+    let reason = if build != our_build {
+        format!(
+            "this worker was built from other sources (build `{build}`) than the coordinator \
+             (build `{our_build}`); build both from the same"
+        )
+    } else if let Some(ours) = ours
+        && reference != &ours[..]
+    {
+        format!(
+            "this worker, with {isa}, makes other pixels of the reference tile than the coordinator; \
+             its compiler or its processor errs"
+        )
+    } else {
+        return Ok(());
+    };
+    tracing::warn!(host, reason, "refused a worker");
+    Err(Status::failed_precondition(reason))
 }
 
 #[expect(clippy::needless_pass_by_value, reason = "`map_err` hands it over")]

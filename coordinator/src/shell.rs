@@ -33,6 +33,11 @@ use crate::{
 pub struct Config {
     /// Workers and clients of another version are refused.
     pub version: String,
+    /// Of the sources that pixels depend on. Workers of another are refused.
+    pub build: String,
+    /// What the reference tile hashes to. Workers that make another of it are refused, unless there
+    /// is none here.
+    pub reference: Option<[u8; 32]>,
     /// How long a lease lives without progress.
     pub term: Duration,
     /// Of the tiles, from 0 to 1, that another worker renders again, to compare; besides those each

@@ -24,6 +24,8 @@ const SCENE: &str = "viewport\norigin 0 0 -2\ntopleft -1 1 0\nbottomleft -1 -1 0
     background 10 20 30\nendviewport\n";
 
 const VERSION: &str = "1.2.3";
+const BUILD: &str = "a1b2";
+const REFERENCE: [u8; 32] = [0xab; 32];
 
 /// A farm with one worker, played by the test, and one job of 2 x 1 tiles of 8 x 8 pixels.
 struct Farm {
@@ -46,6 +48,8 @@ impl Farm {
             format!("http://{}", listener.local_addr().unwrap()).parse().unwrap();
         let coordinator = Coordinator::new(Config {
             version: VERSION.to_owned(),
+            build: BUILD.to_owned(),
+            reference: Some(REFERENCE),
             term: Duration::from_millis(300),
             audit: 0.0,
             upload_silence: Duration::from_millis(600),
@@ -180,8 +184,34 @@ fn join(version: &str) -> wire::JoinRequest {
         protocol: PROTOCOL,
         nonce: 1,
         threads: 1,
+        isa: "avx2".to_owned(),
+        build: BUILD.to_owned(),
+        reference: REFERENCE.to_vec().into(),
         ..wire::JoinRequest::default()
     }
+}
+
+#[tokio::test]
+async fn a_worker_that_would_make_other_pixels_is_refused_and_told_why() {
+    let mut farm = Farm::new().await;
+    let refusals = [
+        (join("1.2.4"), "rtfarm 1.2.4"),
+        (
+            wire::JoinRequest { build: "c3d4".to_owned(), ..join(VERSION) },
+            "built from other sources (build `c3d4`) than the coordinator (build `a1b2`)",
+        ),
+        (
+            wire::JoinRequest { reference: vec![0xcd; 32].into(), ..join(VERSION) },
+            "with avx2, makes other pixels of the reference tile",
+        ),
+        (wire::JoinRequest { reference: vec![].into(), ..join(VERSION) }, "reference tile"),
+    ];
+    for (request, reason) in refusals {
+        let status = farm.tiles.join(request).await.unwrap_err();
+        assert_eq!(status.code(), Code::FailedPrecondition);
+        assert!(status.message().contains(reason), "{}", status.message());
+    }
+    farm.tiles.join(join(VERSION)).await.unwrap();
 }
 
 #[tokio::test]

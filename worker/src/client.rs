@@ -40,6 +40,8 @@ pub(crate) fn introduction(config: &Config, nonce: u64) -> wire::JoinRequest {
         isa: config.isa.to_string(),
         host: rustix::system::uname().nodename().to_string_lossy().into_owned(),
         process: std::process::id(),
+        build: config.build.clone(),
+        reference: config.reference.map(|hash| hash.to_vec().into()).unwrap_or_default(),
     }
 }
 

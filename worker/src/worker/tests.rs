@@ -102,6 +102,8 @@ impl Bench {
             threads,
             isa: rtfarm_core::isa::Isa::fastest(),
             version: "1".to_owned(),
+            build: String::new(),
+            reference: None,
             patience,
         };
         let now = start();
@@ -388,7 +390,7 @@ fn pixels_are_kept_until_they_are_acknowledged() {
 
 #[test]
 fn progress_is_told_tile_by_tile_one_renewal_at_a_time() {
-    let mut bench = Bench::rendering(1, 2);
+    let mut bench = Bench::rendering(2, 2);
     bench.answer(is_lease, run(2, 9, 0));
     assert!(!bench.has(is_renew), "time alone renews nothing");
     bench.step(1, 0);
@@ -604,6 +606,8 @@ fn workers_do_not_all_ask_again_at_once() {
         threads: 1,
         isa: rtfarm_core::isa::Isa::fastest(),
         version: "1".to_owned(),
+        build: String::new(),
+        reference: None,
         patience: PATIENCE,
     };
     let now = start();
