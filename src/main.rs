@@ -15,6 +15,7 @@ mod plain;
 mod private_folder;
 mod render;
 mod report;
+mod resume;
 mod scene_files;
 mod source;
 mod submission;

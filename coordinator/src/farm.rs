@@ -47,6 +47,8 @@ pub(crate) struct Farm {
     stranger_count: u64,
     /// Tiles that came from workers that were never to render them.
     ungranted_count: u64,
+    /// Jobs are there again when the farm is: it may stop before they have ended.
+    keeps_jobs: bool,
     term: Duration,
     members: Members,
     leases: Leases,
@@ -69,6 +71,7 @@ pub(crate) struct Farm {
 #[derive(Debug)]
 struct JobState {
     started: Instant,
+    earlier: Earlier,
     progress: Progress,
     contributors: BTreeSet<WorkerId>,
     /// Workers that brought pixels that make no sense. They get no more tiles of this job while
@@ -79,6 +82,17 @@ struct JobState {
     storing: BTreeMap<TileId, Storing>,
     /// Tiles of which copies differ, and nobody could say which is right.
     unsettled: BTreeSet<TileId>,
+}
+
+/// What earlier starts of a farm did for a job.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub(crate) struct Earlier {
+    /// How long they were there for it.
+    pub(crate) elapsed: Duration,
+    /// What the tiles in its picture took.
+    pub(crate) tally: Tally,
+    /// Workers that brought some of them.
+    pub(crate) worker_count: u32,
 }
 
 /// A tile whose pixels are on their way into the picture.
@@ -161,6 +175,8 @@ pub(crate) enum Action {
     Store(DeliveryId, JobId, TileId),
     /// Answer a delivery.
     Acknowledge(DeliveryId, Verdict),
+    /// Forget what is kept of tiles that are not in the picture any more.
+    TakeBack(JobId, Vec<TileId>),
     /// Show those who watch a job how far it is.
     Publish(JobId, Progress),
     /// Drop a job's scene and picture.
@@ -206,6 +222,26 @@ pub(crate) enum Notice {
     Strangers(u64),
 }
 
+impl JobState {
+    fn new(progress: Progress, earlier: Earlier, now: Instant) -> Self {
+        Self {
+            started: now,
+            earlier,
+            progress,
+            contributors: BTreeSet::new(),
+            suspects: BTreeSet::new(),
+            senseless: BTreeMap::new(),
+            storing: BTreeMap::new(),
+            unsettled: BTreeSet::new(),
+        }
+    }
+
+    /// How long it has been rendered.
+    fn elapsed(&self, now: Instant) -> Duration {
+        self.earlier.elapsed + (now - self.started)
+    }
+}
+
 impl Farm {
     /// Makes a farm without members and jobs. A lease lives for `term` after the last progress.
     pub(crate) fn new(identity: Identity, term: Duration, audit: Audit) -> Self {
@@ -213,6 +249,7 @@ impl Farm {
             identity,
             stranger_count: 0,
             ungranted_count: 0,
+            keeps_jobs: false,
             term,
             members: Members::new(LONGEST_SILENCE.max(term)),
             leases: Leases::new(term),
@@ -226,6 +263,16 @@ impl Farm {
             last_job: identity.job_before_first(),
             phase: Phase::Open,
         }
+    }
+
+    /// Makes a farm whose jobs outlive it, of which `last_job` was the last so far.
+    pub(crate) fn keeping_jobs(
+        identity: Identity,
+        term: Duration,
+        audit: Audit,
+        last_job: JobId,
+    ) -> Self {
+        Self { keeps_jobs: true, last_job, ..Self::new(identity, term, audit) }
     }
 
     /// When [`Farm::on_time`] is to be called next, at the latest.
@@ -376,6 +423,25 @@ impl Farm {
         }
         self.serve(now, &mut actions);
         actions
+    }
+
+    /// Event: a worker has pixels of these tiles of a job, which it rendered for an earlier start of
+    /// this farm. Those that are free are leased to it, as any tile is.
+    pub(crate) fn on_offer(
+        &mut self,
+        worker: WorkerId,
+        job: JobId,
+        numbers: &[u32],
+        now: Instant,
+    ) -> Option<Run> {
+        self.members.on_sign_of_life(worker, now).ok()?;
+        if self.phase != Phase::Open || !self.may_render(worker, job) {
+            return None;
+        }
+        let grid = self.leases.tiles(job)?.grid();
+        let tiles: Vec<TileId> = numbers.iter().filter_map(|&number| grid.tile(number)).collect();
+        let threads = self.members.threads(worker).0;
+        self.leases.on_offer((worker, threads), job, &tiles, now)
     }
 
     /// Event: nobody waits for the answer to a question any longer.
@@ -632,8 +698,8 @@ impl Farm {
         let the_first = job.contributors.insert(worker);
         job.progress.tiles_done = done;
         job.progress.tally.add(&delivery.tally);
-        job.progress.worker_count = job.contributors.len() as u32;
-        let (progress, elapsed) = (job.progress.clone(), now - job.started);
+        job.progress.worker_count = job.earlier.worker_count.max(job.contributors.len() as u32);
+        let (progress, elapsed) = (job.progress.clone(), job.elapsed(now));
         let mut actions = vec![Action::Acknowledge(storing.id, Verdict::Accepted)];
         actions.push(Action::Publish(id, progress.clone()));
         actions.push(Action::Log(Notice::TileDone { delivery, progress, elapsed }));
@@ -676,28 +742,52 @@ impl Farm {
         self.last_job
     }
 
-    /// Event: a picture of these tiles, all of them free, is ordered under a number from
-    /// [`Farm::number_job`].
-    pub(crate) fn on_submit(&mut self, id: JobId, tiles: Tiles, now: Instant) -> Vec<Action> {
-        let progress = Progress { tile_count: tiles.grid().count(), ..Progress::default() };
-        let job = JobState {
-            started: now,
-            progress,
-            contributors: BTreeSet::new(),
-            suspects: BTreeSet::new(),
-            senseless: BTreeMap::new(),
-            storing: BTreeMap::new(),
-            unsettled: BTreeSet::new(),
+    /// Event: a picture is ordered under a number from [`Farm::number_job`]. Some of its tiles may be
+    /// done already, the others are free.
+    pub(crate) fn on_order(
+        &mut self,
+        id: JobId,
+        tiles: Tiles,
+        earlier: Earlier,
+        now: Instant,
+    ) -> Vec<Action> {
+        let progress = Progress {
+            tiles_done: tiles.done_count(),
+            tile_count: tiles.grid().count(),
+            tally: earlier.tally,
+            worker_count: earlier.worker_count,
+            ..Progress::default()
         };
+        let is_whole = progress.tiles_done == progress.tile_count;
+        let is_begun = progress.tiles_done > 0;
+        let mut actions = Vec::from_iter(is_begun.then(|| Action::Publish(id, progress.clone())));
+        let job = JobState::new(progress, earlier, now);
+        let elapsed = job.elapsed(now);
         self.jobs.insert(id, job);
         self.leases.on_submit(id, tiles);
-        let mut actions = Vec::new();
-        if self.phase == Phase::Open {
+        if is_whole {
+            self.end(id, Outcome::Finished(elapsed), &mut actions);
+        } else if self.phase == Phase::Open {
             self.serve(now, &mut actions);
         } else {
             self.fail(id, STOPPED.to_owned(), &mut actions);
         }
         actions
+    }
+
+    /// Event: a job that has ended so is there for its clients, as an earlier start of the farm
+    /// kept it.
+    pub(crate) fn on_kept(&mut self, id: JobId, progress: Progress, now: Instant) -> Vec<Action> {
+        debug_assert!(progress.outcome.is_some(), "it has ended");
+        let mut actions = vec![Action::Publish(id, progress.clone())];
+        self.jobs.insert(id, JobState::new(progress, Earlier::default(), now));
+        self.keep_ended(id, &mut actions);
+        actions
+    }
+
+    /// What a job has got so far: how long it has been rendered, and how many workers brought tiles.
+    pub(crate) fn so_far(&self, job: JobId, now: Instant) -> Option<(Duration, u32)> {
+        self.jobs.get(&job).map(|job| (job.elapsed(now), job.progress.worker_count))
     }
 
     /// Event: nobody wants a job's picture any more.
@@ -736,7 +826,7 @@ impl Farm {
                 self.finishing.insert(id, since);
                 continue;
             }
-            let time = self.jobs.get(&id).map_or(Duration::ZERO, |job| now - job.started);
+            let time = self.jobs.get(&id).map_or(Duration::ZERO, |job| job.elapsed(now));
             if let Some(reason) = self.failure(id) {
                 self.fail(id, reason, actions);
             } else {
@@ -793,13 +883,18 @@ impl Farm {
         self.leases.on_end(id);
         self.audit.on_end(id);
         self.finishing.remove(&id);
+        self.keep_ended(id, actions);
+        true
+    }
+
+    /// Keeps a job that has ended for its clients; another one may have to go.
+    fn keep_ended(&mut self, id: JobId, actions: &mut Vec<Action>) {
         self.ended.push_back(id);
         if self.ended.len() > KEPT_AFTER_END
             && let Some(oldest) = self.ended.pop_front()
         {
             self.forget(oldest, actions);
         }
-        true
     }
 
     fn forget(&mut self, job: JobId, actions: &mut Vec<Action>) {
@@ -823,12 +918,15 @@ impl Farm {
         actions
     }
 
-    /// Event: the coordinator is to stop. Workers are sent home, and every job has ended.
+    /// Event: the coordinator is to stop. Workers are sent home, and every job that will not be there
+    /// again has ended.
     pub(crate) fn on_shut_down(&mut self, now: Instant) -> Vec<Action> {
         let mut actions = self.on_close();
-        let jobs: Vec<JobId> = self.jobs.keys().copied().collect();
-        for job in jobs {
-            self.fail(job, STOPPED.to_owned(), &mut actions);
+        if !self.keeps_jobs {
+            let jobs: Vec<JobId> = self.jobs.keys().copied().collect();
+            for job in jobs {
+                self.fail(job, STOPPED.to_owned(), &mut actions);
+            }
         }
         self.phase = Phase::Farewell(now + FAREWELL);
         self.end_farewell(now, &mut actions);
@@ -854,6 +952,11 @@ impl Farm {
 
 #[cfg(test)]
 impl Farm {
+    /// Event: a picture of these tiles, all of them free, is ordered.
+    pub(crate) fn on_submit(&mut self, id: JobId, tiles: Tiles, now: Instant) -> Vec<Action> {
+        self.on_order(id, tiles, Earlier::default(), now)
+    }
+
     /// Which start of the farm this is.
     pub(crate) fn incarnation(&self) -> Incarnation {
         self.identity.incarnation

@@ -206,7 +206,7 @@ impl Leases {
         self.of(worker).any(|id| self.held[&id].is_lone)
     }
 
-    /// Event: a job is to be rendered, of which all tiles are free.
+    /// Event: a job is to be rendered, of which no tile is in a lease.
     pub(crate) fn on_submit(&mut self, id: JobId, tiles: Tiles) {
         self.jobs.insert(id, Job { tiles, pace: Pace::default(), granted: BTreeMap::new() });
         self.index_job(id);
@@ -257,6 +257,25 @@ impl Leases {
         lease.is_lone = true;
         self.index(run.lease.id);
         Some(run)
+    }
+
+    /// Event: `worker` has pixels of these tiles of `job`. It gets those that are free; `None` when none
+    /// is.
+    pub(crate) fn on_offer(
+        &mut self,
+        (worker, threads): (WorkerId, usize),
+        job: JobId,
+        offered: &[TileId],
+        now: Instant,
+    ) -> Option<Run> {
+        let id = LeaseId(self.last_id.0 + 1);
+        let places = self.jobs.get_mut(&job)?.tiles.take(offered, id);
+        self.index_job(job);
+        if places.is_empty() {
+            return None;
+        }
+        self.last_id = id;
+        Some(self.grant((worker, threads), job, [places, NONE, NONE], now))
     }
 
     /// Event: `worker` would render a tile of the lease `quiet` a second time. It gets the last

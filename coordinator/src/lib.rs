@@ -7,7 +7,8 @@
 //! knows only what stands before it:
 //!
 //! ```text
-//! identity, tiles, pace <- lease, members, waiting, audit <- farm, store, job <- shell <- service <- run
+//! identity, tiles, pace <- lease, members, waiting, audit <- farm, store, record <- state <- job
+//! job <- shell <- service <- run
 //! accept <- run
 //! ```
 
@@ -19,11 +20,15 @@ mod job;
 mod lease;
 mod members;
 mod pace;
+mod record;
+#[cfg(test)]
+mod restart;
 mod run;
 mod service;
 mod shell;
 #[cfg(test)]
 mod simulation;
+mod state;
 #[cfg(test)]
 mod steady;
 mod store;
@@ -33,3 +38,4 @@ mod waiting;
 pub use job::Job;
 pub use run::{Coordinator, Listener};
 pub use shell::{Config, SubmitError};
+pub use state::{Durability, StateError, StateFolder};

@@ -16,7 +16,7 @@ use rtfarm_proto::{Incarnation, JobId, LeaseId, LeaseName, Renewal, WorkerId};
 
 use crate::{
     audit::Audit,
-    farm::{Action, Delivery, DeliveryId, Farm, Next, Notice, Verdict},
+    farm::{Action, Delivery, DeliveryId, Earlier, Farm, Next, Notice, Verdict},
     identity::Identity,
     members::Process,
     tiles::{PixelHash, Tiles},
@@ -64,9 +64,13 @@ fn identity(seed: u64, start: u32) -> Identity {
     Identity::from_random([(); 24].map(|()| random.below(256) as u8))
 }
 
-/// A farm; every other compares all tiles.
-fn farm(seed: u64, start: u32) -> Farm {
-    Farm::new(identity(seed, start), TERM, Audit::new((seed % 2) as f64, [7; 32]))
+/// What compares all tiles in every other farm.
+fn audit(seed: u64) -> Audit {
+    Audit::new((seed % 2) as f64, [7; 32])
+}
+
+fn grid() -> TileGrid {
+    TileGrid::new(Size::new(7 * 16, 5 * 16).unwrap(), 16).unwrap()
 }
 
 /// What the pixels of a tile hash to in a job that shows `scene`.
@@ -157,7 +161,7 @@ impl World {
             seed,
             random: SplitMix64(seed),
             now,
-            farm: farm(seed, 0),
+            farm: Farm::new(identity(seed, 0), TERM, audit(seed)),
             last_number: 0,
             renderers: Vec::new(),
             most_renderers: 1 + (seed % 5) as usize,
@@ -251,6 +255,11 @@ impl World {
                     assert!(!self.outcomes.contains_key(&job), "job {job} has ended");
                     self.outcomes.extend(progress.outcome.map(|outcome| (job, outcome)));
                 }
+                Action::TakeBack(job, tiles) => {
+                    for tile in tiles {
+                        assert!(self.picture.remove(&(job, tile)).is_some());
+                    }
+                }
                 Action::Forget(job) => assert!(self.forgotten.insert(job)),
                 Action::Log(Notice::TileDone { delivery, .. }) => {
                     assert!(self.logged.insert((delivery.lease.job, delivery.tile)));
@@ -268,10 +277,7 @@ impl World {
                 }
                 Action::Log(Notice::TakenBack { worker, job, tiles }) => {
                     assert!(self.liars.contains(&worker));
-                    for tile in tiles {
-                        assert!(self.picture.remove(&(job, tile)).is_some());
-                        assert!(self.logged.remove(&(job, tile)));
-                    }
+                    assert!(tiles.iter().all(|&tile| self.logged.remove(&(job, tile))));
                 }
                 Action::Log(Notice::NoAudit) => self.was_without_audit = true,
                 Action::Log(_) => {}
@@ -350,12 +356,11 @@ impl World {
     /// Clients order pictures of 7 x 5 tiles, and may change their minds.
     fn submit_or_cancel(&mut self) {
         if self.jobs.len() < JOBS && (self.jobs.is_empty() || self.random.one_in(50)) {
-            let grid = TileGrid::new(Size::new(7 * 16, 5 * 16).unwrap(), 16).unwrap();
             let job = self.farm.number_job();
             self.scene_count += 1;
             assert_eq!(self.jobs.insert(job, self.scene_count), None, "a number is given twice");
             self.shown.insert(job, self.scene_count);
-            let actions = self.farm.on_submit(job, Tiles::new(grid), self.now);
+            let actions = self.farm.on_submit(job, Tiles::new(grid()), self.now);
             self.act(actions);
         }
         if self.random.one_in(400) {
@@ -377,11 +382,17 @@ impl World {
         admitted.is_ok()
     }
 
-    /// The coordinator is killed and started anew: connections break, pictures are gone, workers
-    /// and their pixels are not.
+    /// The coordinator is killed and started anew: connections break, workers and their pixels stay. It
+    /// may have kept jobs and pictures, or they are gone.
     fn restart(&mut self) {
         self.restart_count += 1;
-        self.farm = farm(self.seed, self.restart_count);
+        let identity = identity(self.seed, self.restart_count);
+        let keeps_jobs = (self.seed / 2 + u64::from(self.restart_count)).is_multiple_of(2)
+            && !self.jobs.is_empty();
+        self.farm = match self.shown.keys().last() {
+            Some(&last) if keeps_jobs => Farm::keeping_jobs(identity, TERM, audit(self.seed), last),
+            _ => Farm::new(identity, TERM, audit(self.seed)),
+        };
         self.liars.clear();
         self.asks.clear();
         self.deliveries.clear();
@@ -389,9 +400,26 @@ impl World {
         for renderer in &mut self.renderers {
             renderer.ask = None;
         }
-        self.forgotten.extend(self.jobs.keys());
-        let outcomes = &self.outcomes;
-        self.jobs.retain(|job, _| outcomes.contains_key(job));
+        if !keeps_jobs {
+            self.forgotten.extend(self.jobs.keys());
+            let outcomes = &self.outcomes;
+            self.jobs.retain(|job, _| outcomes.contains_key(job));
+        }
+        // What an earlier start took is not compared any more.
+        self.was_without_audit |= keeps_jobs;
+        for id in self.jobs.keys().copied().collect::<Vec<JobId>>() {
+            if self.outcomes.contains_key(&id) {
+                self.forgotten.insert(id);
+                continue;
+            }
+            let mut tiles = Tiles::new(grid());
+            for (&(_, tile), written) in self.picture.iter().filter(|((job, _), _)| *job == id) {
+                tiles.set_done(tile, written[0]);
+            }
+            self.set_aside.retain(|(job, _)| *job != id);
+            let actions = self.farm.on_order(id, tiles, Earlier::default(), self.now);
+            self.act(actions);
+        }
     }
 
     /// One process dies, stalls or works.

@@ -103,6 +103,13 @@ impl Tiles {
         Self { grid, order, by_number, free, suspects, aside, losses, done_count: 0 }
     }
 
+    /// Says of a free tile that pixels with this hash are in the picture already.
+    pub(crate) fn set_done(&mut self, tile: TileId, hash: PixelHash) {
+        // Of a worker of an earlier start of the farm: it has no number now.
+        self.on_pixels(tile, Rendering { worker: WorkerId(0), hash });
+        self.on_stored(tile);
+    }
+
     /// The frame and how it is cut into these tiles.
     pub(crate) fn grid(&self) -> TileGrid {
         self.grid
@@ -155,6 +162,19 @@ impl Tiles {
     /// Says whether no pixels of a tile have come, or what came was taken back.
     pub(crate) fn is_open(&self, tile: TileId) -> bool {
         matches!(self.by_number[tile.index()].state, State::Open(_))
+    }
+
+    /// Puts those of these tiles that are free into `lease`.
+    pub(crate) fn take(&mut self, tiles: &[TileId], lease: LeaseId) -> BTreeSet<Place> {
+        let mut taken = BTreeSet::new();
+        for tile in tiles {
+            let Tile { place, state } = &mut self.by_number[tile.index()];
+            if self.free.remove(place) {
+                *state = State::Open(Holders([Some(lease), None]));
+                taken.insert(*place);
+            }
+        }
+        taken
     }
 
     /// Puts the first free tile that is under suspicion into `lease`.

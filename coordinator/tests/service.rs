@@ -9,7 +9,7 @@ use rtfarm_core::{
     tile::{Size, TileGrid},
 };
 use rtfarm_proto::{
-    Address, JobId, LeaseName, PROTOCOL, TileHasher, pixels_to_bytes, scene_hash,
+    Address, Bytes, JobId, LeaseName, PROTOCOL, TileHasher, pixels_to_bytes, scene_hash,
     wire::{
         self, event::End, farm_client::FarmClient, jobs_client::JobsClient, lease_response::Next,
         submit_request::Part, submit_response::Outcome,
@@ -35,6 +35,8 @@ struct Farm {
     jobs: JobsClient<Channel>,
     worker: u32,
     incarnation: u64,
+    /// The id that clients name.
+    named: Bytes,
     job: u64,
     scene: SceneHash,
     settings: Settings,
@@ -68,8 +70,7 @@ impl Farm {
             .map(|part| wire::SubmitRequest { part: Some(part) });
         let answer = jobs.submit(tokio_stream::iter(parts)).await.unwrap().into_inner();
         let Some(Outcome::Accepted(accepted)) = answer.outcome else { panic!("{answer:?}") };
-        assert_eq!((accepted.tile_count, accepted.incarnation), (2, incarnation));
-        assert_eq!(accepted.farm, joined.farm);
+        assert_eq!((accepted.tile_count, &accepted.farm), (2, &joined.farm));
         Self {
             _folder: folder,
             address,
@@ -77,6 +78,7 @@ impl Farm {
             jobs,
             worker,
             incarnation,
+            named: accepted.farm,
             job: accepted.job,
             scene: SceneHash([0; 32]),
             settings: Settings { size: Size::new(16, 8).unwrap(), quality: Quality::default() },
@@ -89,6 +91,7 @@ impl Farm {
             max_tiles: 64,
             wait_ms: 5000,
             incarnation: self.incarnation,
+            kept: None,
         };
         match self.tiles.lease(request).await.unwrap().into_inner().next {
             Some(Next::Run(run)) => {
@@ -145,7 +148,7 @@ impl Farm {
 
     /// The state of the job now.
     async fn state(&mut self) -> wire::Event {
-        let request = wire::WatchRequest { job: self.job, incarnation: self.incarnation };
+        let request = wire::WatchRequest { job: self.job, farm: self.named.clone() };
         let mut events = self.jobs.watch(request).await.unwrap().into_inner();
         events.message().await.unwrap().unwrap()
     }
@@ -160,6 +163,11 @@ fn finished(lease: LeaseName, tile: u32, pixels: Vec<u8>, hash: Vec<u8>) -> wire
         seconds: 0.1,
         tally: Some(wire::Tally { rays: 64, ..wire::Tally::default() }),
     }
+}
+
+/// A question of a worker for a tile, which waits for nothing.
+fn lease_of(worker: u32, incarnation: u64) -> wire::LeaseRequest {
+    wire::LeaseRequest { worker, max_tiles: 1, wait_ms: 0, incarnation, kept: None }
 }
 
 fn order(version: &str) -> wire::Order {
@@ -301,13 +309,13 @@ async fn strangers_are_told_what_is_wrong() {
     assert_eq!(status.code(), Code::FailedPrecondition);
     assert!(status.message().contains("rtfarm 1.2.4") && status.message().contains(VERSION));
     let incarnation = farm.incarnation;
-    let request = wire::LeaseRequest { worker: 77, max_tiles: 1, wait_ms: 0, incarnation };
+    let request = lease_of(77, incarnation);
     assert_eq!(farm.tiles.lease(request).await.unwrap_err().code(), Code::NotFound);
     let request = wire::FetchRequest { scene_hash: vec![1; 32].into(), incarnation };
     assert_eq!(farm.tiles.fetch(request).await.unwrap_err().code(), Code::NotFound);
-    let request = wire::WatchRequest { job: 77, incarnation };
+    let request = wire::WatchRequest { job: 77, farm: farm.named.clone() };
     assert_eq!(farm.jobs.watch(request).await.unwrap_err().code(), Code::NotFound);
-    let request = wire::ImageRequest { job: farm.job, incarnation };
+    let request = wire::ImageRequest { job: farm.job, farm: farm.named.clone() };
     assert_eq!(farm.jobs.image(request).await.unwrap_err().code(), Code::FailedPrecondition);
 }
 
@@ -357,6 +365,7 @@ async fn a_client_that_goes_while_its_scene_is_prepared_leaves_no_job() {
         incarnation: farm.incarnation,
         max_tiles: 64,
         wait_ms: 5000,
+        kept: None,
     };
     let next = farm.tiles.lease(request).await.unwrap().into_inner().next;
     assert!(matches!(next, Some(Next::Nothing(_))), "{next:?}");
@@ -434,7 +443,7 @@ async fn calls_meant_for_another_start_of_the_coordinator_are_refused() {
     let mut farm = Farm::new().await;
     let (lease, tiles) = farm.lease().await;
     let (worker, job, incarnation) = (farm.worker, farm.job, farm.incarnation ^ 1);
-    let request = wire::LeaseRequest { worker, incarnation, max_tiles: 1, wait_ms: 0 };
+    let request = lease_of(worker, incarnation);
     let status = farm.tiles.lease(request).await.unwrap_err();
     assert_eq!(status.code(), Code::NotFound);
     assert!(status.message().contains("not meant for this start"), "{status}");
@@ -443,9 +452,10 @@ async fn calls_meant_for_another_start_of_the_coordinator_are_refused() {
     assert_eq!(farm.tiles.renew(request).await.unwrap_err().code(), Code::NotFound);
     let request = wire::LeaveRequest { worker, incarnation, reason: String::new() };
     assert_eq!(farm.tiles.leave(request).await.unwrap_err().code(), Code::NotFound);
-    let request = wire::WatchRequest { job, incarnation };
+    let another: Bytes = farm.named.iter().map(|byte| byte ^ 1).collect();
+    let request = wire::WatchRequest { job, farm: another.clone() };
     assert_eq!(farm.jobs.watch(request).await.unwrap_err().code(), Code::NotFound);
-    let request = wire::CancelRequest { job, incarnation };
+    let request = wire::CancelRequest { job, farm: another };
     assert_eq!(farm.jobs.cancel(request).await.unwrap_err().code(), Code::NotFound);
     farm.incarnation ^= 1;
     assert_eq!(farm.deliver(lease, tiles[0], 0.5).await, Err(Code::NotFound));

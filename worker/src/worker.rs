@@ -10,10 +10,10 @@ use std::{
 };
 
 use rtfarm_core::{prepared::SceneHash, tile::TileId};
-use rtfarm_proto::{Address, DELIVERY_BYTES, LONGEST_WAIT, LeaseName, Renewal};
+use rtfarm_proto::{Address, DELIVERY_BYTES, FarmId, JobId, LONGEST_WAIT, LeaseName, Renewal};
 
 use crate::{
-    call::{Answer, Call, CallError, CallErrorKind, Delivery, Membership, Next, Run},
+    call::{Answer, Call, CallError, CallErrorKind, Delivery, KeptTiles, Membership, Next, Run},
     config::Config,
     error::WorkerError,
     job::Job,
@@ -52,10 +52,16 @@ pub(crate) struct Worker {
     coordinator: Address,
     threads: usize,
     tasks: Tasks,
+    /// The farm that it last joined, and pixels that it rendered for an earlier start of that farm.
+    farm: Option<FarmId>,
+    kept: Kept,
     stage: Stage,
     /// Set when this worker only finishes what its threads have in hand: until when it may.
     drain_until: Option<Instant>,
 }
+
+/// Finished tiles that no coordinator has acknowledged.
+type Kept = BTreeMap<(JobId, TileId), Delivery>;
 
 #[derive(Debug)]
 enum Stage {
@@ -86,6 +92,8 @@ struct Member {
     rendering_count: usize,
     /// Tiles that wait to be delivered.
     rendered: VecDeque<Delivery>,
+    /// Tiles whose pixels wait to be leased once more.
+    kept: Kept,
     /// Tiles on their way to the coordinator, which has not acknowledged them yet.
     delivering_count: usize,
     is_leasing: bool,
@@ -122,6 +130,8 @@ impl Worker {
             coordinator: config.coordinator.clone(),
             threads: config.threads,
             tasks,
+            farm: None,
+            kept: Kept::new(),
             stage: Stage::Joining,
             drain_until: None,
         }
@@ -146,7 +156,12 @@ impl Worker {
                 let (worker, coordinator) = (member.worker.0, &self.coordinator);
                 tracing::info!(worker, %coordinator, %farm, "joined");
                 self.tasks.push(Action::HearBeats { period: term / BEATS_A_TERM });
-                self.stage = Stage::Working(Member::new(member, self.threads));
+                // Another farm's jobs have the same numbers.
+                if self.farm.replace(farm) != Some(farm) {
+                    self.kept.clear();
+                }
+                let kept = mem::take(&mut self.kept);
+                self.stage = Stage::Working(Member { kept, ..Member::new(member, self.threads) });
             }
             (Stage::Working(member), Answer::Leased(next)) => {
                 member.is_leasing = false;
@@ -155,8 +170,12 @@ impl Worker {
                     Next::Nothing => {}
                     Next::ShutDown => {
                         tracing::info!(worker = member.id.worker.0, "sent home");
-                        self.end(Ok(()));
+                        return self.end(Ok(()));
                     }
+                }
+                // What was offered and not leased is not wanted.
+                if let Call::Lease { kept: Some(offered), .. } = call {
+                    member.kept.retain(|(job, _), _| *job != offered.job);
                 }
             }
             (Stage::Working(member), Answer::Renewed { lost }) => {
@@ -264,7 +283,7 @@ impl Worker {
             (Call::Connect, _) => WorkerError::Connect(self.coordinator.clone(), message),
             (Call::Join, CallErrorKind::Refused) => WorkerError::Refused(message),
             (Call::Join, _) => WorkerError::Gone(message),
-            (_, CallErrorKind::NotMember) => return self.join_again(&message, now),
+            (_, CallErrorKind::NotMember) => return self.join_again(call, &message, now),
             (_, CallErrorKind::Nonsense) => WorkerError::Nonsense(message),
             _ => WorkerError::Gone(message),
         };
@@ -275,14 +294,21 @@ impl Worker {
     }
 
     /// The coordinator does not know this worker any more, nor its leases: it may have been started
-    /// anew. What was rendered for those leases is of no use.
-    fn join_again(&mut self, reason: &str, now: Instant) {
+    /// anew. Finished tiles are kept, for the same farm may lease them once more.
+    fn join_again(&mut self, unheard: Call, reason: &str, now: Instant) {
         tracing::warn!(reason, "joining again");
-        self.tasks.stop_all();
+        let unheard = self.tasks.stop_all().into_iter().chain([unheard]);
         if let Stage::Working(member) = mem::replace(&mut self.stage, Stage::Joining) {
             for scene in member.scenes {
                 self.tasks.push(Action::ForgetScene(scene));
             }
+            let delivered = unheard.filter_map(|call| match call {
+                Call::Deliver { tiles, .. } => Some(tiles),
+                _ => None,
+            });
+            self.kept = member.kept;
+            let tiles = member.rendered.into_iter().chain(delivered.flatten());
+            self.kept.extend(tiles.map(|tile| ((tile.lease.job, tile.tile), tile)));
         }
         if self.drain_until.is_some() {
             return self.end(Ok(()));
@@ -340,19 +366,30 @@ impl Member {
             turn: 1,
             rendering_count: 0,
             rendered: VecDeque::new(),
+            kept: Kept::new(),
             delivering_count: 0,
             is_leasing: false,
             is_renewing: false,
         }
     }
 
-    fn on_run(&mut self, run: Run, tasks: &mut Tasks) {
+    fn on_run(&mut self, mut run: Run, tasks: &mut Tasks) {
         if run.tiles.is_empty() {
             return;
         }
         let (tiles_left, begun) = (run.tiles.len(), BTreeMap::new());
         let held = Held { tiles_left, work: 0, begun, has_news: false };
-        self.leases.insert(run.lease, held);
+        let lease = run.lease;
+        self.leases.insert(lease, held);
+        run.tiles.retain(|&tile| {
+            let kept = self.kept.remove(&(lease.job, tile));
+            let is_kept = kept.is_some();
+            self.rendered.extend(kept.map(|kept| Delivery { lease, ..kept }));
+            !is_kept
+        });
+        if run.tiles.is_empty() {
+            return;
+        }
         if self.scenes.contains(&run.job.scene) {
             self.queue(run);
         } else {
@@ -449,7 +486,12 @@ impl Member {
             self.is_leasing = true;
             let longest = LONGEST_RUN_A_THREAD.max(LONGEST_RUN_IN_TURNS * self.turn);
             let most_tiles = longest * self.threads;
-            tasks.call(Call::Lease { member: self.id, most_tiles, wait: LONGEST_WAIT }, now);
+            let kept = self.kept.keys().next().map(|&(job, _)| KeptTiles {
+                job,
+                tiles: self.kept.keys().filter(|key| key.0 == job).map(|key| key.1).collect(),
+            });
+            let wait = LONGEST_WAIT;
+            tasks.call(Call::Lease { member: self.id, most_tiles, wait, kept }, now);
         }
         let has_news = self.leases.values().any(|held| held.has_news);
         if has_news && !self.is_renewing {

@@ -715,3 +715,68 @@ fn a_farm_that_shuts_down_ends_every_job_and_stops_with_the_last_worker() {
         assert_eq!(shown(&world.submit(1).1).outcome, Some(stopped), "it comes too late");
     }
 }
+
+#[test]
+fn tiles_that_a_worker_kept_are_leased_to_it_if_they_are_free() {
+    let mut world = World::new();
+    let (kept, other) = (world.join(), world.join());
+    let (job, _) = world.submit(20);
+    let taken = world.lease(other);
+    let grid = world.farm.leases.tiles(job).unwrap().grid();
+    let free = (0..20).find(|&number| !taken.tiles.contains(&grid.tile(number).unwrap())).unwrap();
+    let numbers = [taken.tiles[0].number(), free, 99];
+    let mut offer = |worker, job| {
+        let run = world.farm.on_offer(worker, job, &numbers, world.now);
+        world.farm.check();
+        run
+    };
+    assert_eq!(offer(WorkerId(77), job), None, "nobody knows it");
+    assert_eq!(offer(kept, JobId(7)), None, "there is no such job");
+    let run = offer(kept, job).expect("one of them is free");
+    assert_eq!(run.tiles, [grid.tile(free).unwrap()]);
+    assert_eq!(offer(kept, job), None, "none is free now");
+    let actions = world.stitch(kept, &run);
+    assert!(matches!(verdicts(&actions)[..], [(_, Verdict::Accepted)]), "{actions:?}");
+}
+
+#[test]
+fn a_farm_that_keeps_its_jobs_goes_on_with_them() {
+    let mut world = World::new();
+    let identity = Identity::from_random([2; 24]);
+    world.farm = Farm::keeping_jobs(identity, TERM, Audit::new(0.0, [7; 32]), JobId(5));
+    let grid = TileGrid::new(Size::new(64, 16).unwrap(), 16).unwrap();
+    let done = |numbers: &[u32]| {
+        let mut tiles = Tiles::new(grid);
+        for &number in numbers {
+            tiles.set_done(grid.tile(number).unwrap(), [7; 32]);
+        }
+        tiles
+    };
+    let earlier = Earlier {
+        elapsed: 9 * SECOND,
+        tally: Tally { rays: 30, ..Tally::default() },
+        worker_count: 2,
+    };
+    let actions = world.farm.on_order(JobId(3), done(&[0, 1, 3]), earlier.clone(), world.now);
+    world.farm.check();
+    assert_eq!((shown(&actions).tiles_done, shown(&actions).tally.rays), (3, 30));
+    let worker = world.join();
+    let run = world.lease(worker);
+    assert_eq!(run.tiles, [grid.tile(2).unwrap()]);
+    world.now += SECOND;
+    let progress = shown(&world.stitch(worker, &run));
+    assert_eq!(progress.outcome, Some(Outcome::Finished(10 * SECOND)));
+    assert_eq!((progress.tally.rays, progress.worker_count), (40, 2));
+
+    let whole = world.farm.on_order(JobId(4), done(&[0, 1, 2, 3]), earlier, world.now);
+    world.farm.check();
+    assert_eq!(shown(&whole).outcome, Some(Outcome::Finished(9 * SECOND)));
+    assert_eq!(world.farm.number_job(), JobId(6));
+    let actions = world.farm.on_kept(JobId(1), progress, world.now);
+    world.farm.check();
+    assert!(shown(&actions).outcome.is_some());
+    let (job, _) = world.submit(2);
+    let actions = world.farm.on_shut_down(world.now);
+    assert!(!actions.iter().any(|action| matches!(action, Action::Publish(..))), "{actions:?}");
+    assert!(world.farm.tile(job, 0).is_some(), "it goes on later");
+}

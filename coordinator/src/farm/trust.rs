@@ -61,6 +61,7 @@ impl Farm {
         job.progress.tiles_done -= tiles.len() as u32;
         job.progress.taken_back += tiles.len() as u32;
         self.finishing.remove(&id);
+        actions.push(Action::TakeBack(id, tiles.clone()));
         actions.push(Action::Publish(id, job.progress.clone()));
         actions.push(Action::Log(Notice::TakenBack { worker: liar, job: id, tiles }));
     }
