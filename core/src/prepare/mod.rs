@@ -24,6 +24,7 @@ mod plane_fingerprint;
 mod planes;
 mod ranks;
 mod scale;
+mod solid_boxes;
 mod solid_trees;
 mod sort;
 mod surfaces;
@@ -100,6 +101,7 @@ pub fn prepare_with(
         solids: &faces.solids,
         solid_nodes: &faces.solid_nodes,
         leaves: &faces.leaves,
+        solid_boxes: &faces.solid_boxes,
         first_ranks: &ranks.firsts,
         emitters: &emitters.records,
         emitter_nodes: &emitters.nodes,

@@ -54,8 +54,8 @@ impl KernelWork<View<'_>> for Trace<'_> {
         let (mut scratch, mut stack) = (Scratch::default(), Stack::default());
         for ray in self.rays {
             let mut nearest = Nearest::new(ray);
-            visit(kernel, view, ray, &mut stack, |item| {
-                nearest.meet(view, item, &mut scratch);
+            visit(kernel, view, ray, &mut stack, |item, box_ray| {
+                nearest.meet(view, kernel, box_ray, item, &mut scratch);
                 Step::On(nearest.hit.t)
             });
             self.hits.push(nearest.hit);
@@ -77,9 +77,11 @@ impl KernelWork<View<'_>> for Shadows<'_> {
         for ray in self.rays {
             let shear = Shear::new(ray.origin, ray.direction);
             let mut is_blocked = false;
-            visit(kernel, view, ray, &mut stack, |item| {
-                between(view, ray, &shear, self.ending_on, item, &mut scratch, |_, _| {
+            visit(kernel, view, ray, &mut stack, |item, box_ray| {
+                let aim = (ray, &shear, box_ray, self.ending_on);
+                between(view, kernel, aim, item, &mut scratch, |_, _| {
                     is_blocked = true;
+                    true
                 });
                 if is_blocked { Step::Enough } else { Step::On(ray.reach) }
             });
@@ -104,11 +106,13 @@ impl KernelWork<View<'_>> for ClearShadows<'_> {
             let shear = Shear::new(ray.origin, ray.direction);
             crossed.clear();
             let mut is_blocked = false;
-            visit(kernel, view, ray, &mut stack, |item| {
-                between(view, ray, &shear, self.ending_on, item, &mut scratch, |rank, part| {
+            visit(kernel, view, ray, &mut stack, |item, box_ray| {
+                let aim = (ray, &shear, box_ray, self.ending_on);
+                between(view, kernel, aim, item, &mut scratch, |rank, part| {
                     let share = Face { item, part }.material(view).transmittance();
                     is_blocked |= share == 0.0;
                     crossed.push((rank, share));
+                    is_blocked
                 });
                 if is_blocked { Step::Enough } else { Step::On(ray.reach) }
             });
