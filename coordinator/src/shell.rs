@@ -27,7 +27,7 @@ use crate::{
     record::Plan,
     state::{Durability, KeptJob, StateFolder},
     store::SceneFile,
-    tiles::Tiles,
+    tiles::{MOST_LOSSES, Tiles},
     waiting::{Ask, AskId},
 };
 
@@ -685,6 +685,11 @@ fn log(notice: Notice) {
         Notice::NoAudit => {
             tracing::warn!("tiles are not compared: nobody is there to render them again");
         }
+        Notice::NotCompared(job, tile) => tracing::warn!(
+            job = job.0,
+            tile = tile.number(),
+            "the tile is not compared: {MOST_LOSSES} workers that rendered it again were lost"
+        ),
         Notice::JobFailed(job, reason) => tracing::warn!(job = job.0, reason, "job failed"),
         Notice::NotGranted { worker, lease, tile, count } => {
             tracing::warn!(
