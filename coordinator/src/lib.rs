@@ -7,21 +7,30 @@
 //! knows only what stands before it:
 //!
 //! ```text
-//! identity, tiles <- lease, members, waiting <- farm, store, job <- shell <- service <- run
+//! identity, tiles, pace <- lease, members, waiting, audit <- farm, store, record <- state <- job
+//! job <- shell <- service <- run
 //! accept <- run
 //! ```
 
 mod accept;
+mod audit;
 mod farm;
 mod identity;
 mod job;
 mod lease;
 mod members;
+mod pace;
+mod record;
+#[cfg(test)]
+mod restart;
 mod run;
 mod service;
 mod shell;
 #[cfg(test)]
 mod simulation;
+mod state;
+#[cfg(test)]
+mod steady;
 mod store;
 mod tiles;
 mod waiting;
@@ -29,3 +38,4 @@ mod waiting;
 pub use job::Job;
 pub use run::{Coordinator, Listener};
 pub use shell::{Config, SubmitError};
+pub use state::{Durability, StateError, StateFolder};
