@@ -129,7 +129,7 @@ struct Works {
 }
 
 enum Work {
-    Log(Notice),
+    Log(Box<Notice>),
     /// Writes tiles into a job's picture.
     Store(Arc<Job>, Vec<(TileId, Bytes, TileRecord)>),
     /// Forgets what is kept of tiles.
@@ -265,14 +265,14 @@ impl Shell {
             Action::Forget(job) => {
                 works.in_order.extend(state.jobs.remove(&job).map(Work::Drop));
             }
-            Action::Log(notice) => works.in_order.push(Work::Log(notice)),
+            Action::Log(notice) => works.in_order.push(Work::Log(Box::new(notice))),
             Action::Stop => self.stop.cancel(),
         }
     }
 
     fn do_work(&self, work: Work) {
         match work {
-            Work::Log(notice) => log(notice),
+            Work::Log(notice) => log(*notice),
             Work::Drop(job) => job.forget(),
             Work::TakeBack(job, tiles) => {
                 if let Err(error) = job.canvas.clear(&tiles) {
