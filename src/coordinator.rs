@@ -8,7 +8,7 @@ use std::{
 
 use anyhow::{Context, anyhow};
 use rtfarm_coordinator::{Config, Coordinator, Listener};
-use tokio::net::{TcpListener, lookup_host};
+use tokio::net::lookup_host;
 use tokio_util::sync::CancellationToken;
 
 use crate::{VERSION, args::CoordinatorArgs, failure::Failure, private_folder::PrivateFolder};
@@ -33,8 +33,8 @@ pub(crate) async fn run(
         )));
     }
     let folder = PrivateFolder::new(&args.state.unwrap_or_else(env::temp_dir))?;
-    let listener =
-        TcpListener::bind(address).await.with_context(|| format!("cannot listen on {address}"))?;
+    let listener = rtfarm_coordinator::listen(address)
+        .with_context(|| format!("cannot listen on {address}"))?;
     writeln!(io::stdout().lock(), "listening on http://{}", listener.local_addr()?)
         .context("cannot write to standard output")?;
 

@@ -12,8 +12,9 @@ use rtfarm_proto::{JobId, LeaseId, LeaseName, Renewal, WorkerId};
 
 use crate::tiles::{Arrival, PixelHash, Place, Tiles};
 
-/// The longest run of tiles in one lease: a lost worker costs no more than its rendering.
-const LONGEST_RUN: usize = 64;
+/// The longest run of tiles in one lease. Workers ask for as many as they render in a moment: a lost one
+/// costs no more than that.
+const LONGEST_RUN: usize = 1024;
 
 /// How many times each thread of the farm will ask again, if runs go on at the present length:
 /// runs shorten as the work does, so that all threads finish together.
@@ -231,10 +232,14 @@ impl Leases {
 
     /// Has a lease run out a term from now.
     fn renew(&mut self, id: LeaseId, now: Instant) {
-        if let Some(lease) = self.held.get_mut(&id) {
+        let until = now + self.term;
+        // Tiles of one message come at one time.
+        if let Some(lease) = self.held.get_mut(&id)
+            && lease.until != until
+        {
             self.expiries.remove(&(lease.until, id));
-            lease.until = now + self.term;
-            self.expiries.insert((lease.until, id));
+            lease.until = until;
+            self.expiries.insert((until, id));
         }
     }
 
@@ -283,7 +288,9 @@ impl Leases {
     /// Event: a tile came under a lease, which is not quiet therefore and lives on.
     fn on_tile(&mut self, id: LeaseId, now: Instant) {
         self.renew(id, now);
-        if let Some(lease) = self.held.get_mut(&id) {
+        if let Some(lease) = self.held.get_mut(&id)
+            && lease.last_tile != now
+        {
             if self.last_tiles.remove(&(lease.last_tile, id)) {
                 self.last_tiles.insert((now, id));
             }
@@ -610,7 +617,7 @@ mod tests {
                 .map(|run| run.tiles.len())
                 .collect();
         assert!(lengths.is_sorted_by(|a, b| a >= b), "{lengths:?}");
-        assert_eq!(lengths[0], LONGEST_RUN);
+        assert_eq!(lengths[0], 1000 / 4 / RUNS_PER_THREAD);
         assert_eq!(lengths.last(), Some(&1));
         assert_eq!(lengths.iter().sum::<usize>(), 1000);
     }
