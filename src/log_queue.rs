@@ -18,7 +18,7 @@ pub(crate) struct LogQueue {
 }
 
 /// So many bytes are written at once, or one line: a pipe does not mix them with those of other
-/// processes. Source: POSIX.1-2024, write().
+/// processes. Source: POSIX.1-2024, `write()`.
 const PIECE: usize = 4096;
 
 /// Lines are gathered for so long after others were written.

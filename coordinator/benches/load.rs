@@ -72,6 +72,9 @@ async fn run(load: Load, folder: PathBuf) -> Result<(), Error> {
     let address: Address = format!("http://{}", listener.local_addr()?).parse()?;
     let coordinator = Coordinator::new(Config {
         version: VERSION.to_owned(),
+        build: VERSION.to_owned(),
+        reference: None,
+        audit: 0.0,
         term: Duration::from_secs(60),
         upload_silence: Duration::from_secs(30),
         scene_folder: scenes.path().to_owned(),
@@ -154,6 +157,8 @@ async fn join(
     let mut farm = FarmClient::new(address.connect().await?);
     let introduction = wire::JoinRequest {
         version: VERSION.to_owned(),
+        build: VERSION.to_owned(),
+        reference: vec![0; 32].into(),
         protocol: PROTOCOL,
         nonce: number.into(),
         threads: 1,
@@ -211,6 +216,7 @@ async fn lease(
         incarnation: member.incarnation,
         max_tiles: 64,
         wait_ms: 10_000,
+        ..wire::LeaseRequest::default()
     };
     let Some(Next::Run(run)) = farm.lease(request).await?.into_inner().next else {
         return Err("there are no tiles left".into());

@@ -7,11 +7,13 @@
 //! knows only what stands before it:
 //!
 //! ```text
-//! identity, tiles <- lease, members, waiting <- farm, store, job <- shell <- service <- run
+//! identity, tiles, pace <- lease, members, waiting, audit <- farm, store, record <- state <- job
+//! job <- shell <- service <- run
 //! accept <- run
 //! ```
 
 mod accept;
+mod audit;
 mod farm;
 mod identity;
 mod job;
@@ -19,11 +21,18 @@ mod lease;
 #[cfg(test)]
 mod load;
 mod members;
+mod pace;
+mod record;
+#[cfg(test)]
+mod restart;
 mod run;
 mod service;
 mod shell;
 #[cfg(test)]
 mod simulation;
+mod state;
+#[cfg(test)]
+mod steady;
 mod store;
 mod tiles;
 mod waiting;
@@ -32,3 +41,4 @@ pub use accept::listen;
 pub use job::Job;
 pub use run::{Coordinator, Listener};
 pub use shell::{Config, SubmitError};
+pub use state::{Durability, StateError, StateFolder};

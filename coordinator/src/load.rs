@@ -14,6 +14,7 @@ use rtfarm_job::Progress;
 use rtfarm_proto::{Renewal, WorkerId};
 
 use crate::{
+    audit::Audit,
     farm::{Action, Delivery, DeliveryId, Farm, Next},
     identity::Identity,
     lease::Run,
@@ -71,7 +72,7 @@ impl World {
     #[inline(never)]
     fn bring_and_ask(&mut self, worker: WorkerId, run: &Run) -> Run {
         self.now += Duration::from_micros(100);
-        let renewal = Renewal { lease: run.lease, work: self.number };
+        let renewal = Renewal { lease: run.lease, work: self.number, tiles: Vec::new() };
         self.farm.on_renew(worker, &[renewal], self.now).expect("it is a member");
         self.events += 1;
         for &tile in &run.tiles {
@@ -93,7 +94,7 @@ fn measure(workers: u64) {
     let identity = Identity::from_random([1; 24]);
     let now_at_first = now();
     let mut world = World {
-        farm: Farm::new(identity, Duration::from_secs(60)),
+        farm: Farm::new(identity, Duration::from_secs(60), Audit::new(0.0, [0; 32])),
         now: now_at_first,
         number: 0,
         events: 0,
@@ -105,7 +106,7 @@ fn measure(workers: u64) {
     let mut runs: Vec<(WorkerId, Run)> = (0..workers)
         .map(|nonce| {
             let process = Process { nonce, threads: 1, ..Process::default() };
-            let worker = world.farm.on_join(process, world.now).0;
+            let worker = world.farm.on_join(process, world.now).0.expect("it is let in");
             (worker, world.ask(worker))
         })
         .collect();

@@ -17,7 +17,7 @@ use rustix::{
     io::Errno,
 };
 
-use crate::{PictureFormat, exr, png};
+use crate::{Disk, PictureFormat, exr, png};
 
 /// Why a tile cannot be put into a picture.
 #[derive(Debug, thiserror::Error)]
@@ -63,6 +63,7 @@ pub struct Picture {
     window: Area,
     format: PictureFormat,
     transfer: Transfer,
+    disk: Disk,
 }
 
 impl Picture {
@@ -76,7 +77,18 @@ impl Picture {
     ) -> io::Result<Self> {
         let window = window.into();
         file.set_len(Self::byte_count(window.size(), format))?;
-        Ok(Self { file, window, format, transfer })
+        Ok(Self::with(file, window, format, transfer, Disk::default()))
+    }
+
+    /// Takes a file that has the length of such a picture.
+    pub(crate) fn with(
+        file: File,
+        window: Area,
+        format: PictureFormat,
+        transfer: Transfer,
+        disk: Disk,
+    ) -> Self {
+        Self { file, window, format, transfer, disk }
     }
 
     /// Makes a black picture in a file of `folder` that has no name, so that nothing stays behind
@@ -89,14 +101,7 @@ impl Picture {
     ) -> io::Result<Self> {
         let file = tempfile::tempfile_in(folder)?;
         let window = window.into();
-        let byte_count = Self::byte_count(window.size(), format);
-        loop {
-            match fallocate(&file, FallocateFlags::empty(), 0, byte_count) {
-                Ok(()) | Err(Errno::OPNOTSUPP) => break,
-                Err(Errno::INTR) => {}
-                Err(error) => return Err(error.into()),
-            }
-        }
+        reserve(&file, Self::byte_count(window.size(), format))?;
         Self::new(file, window, format, transfer)
     }
 
@@ -116,7 +121,7 @@ impl Picture {
     }
 
     /// The curve by which a PNG is encoded.
-    pub(crate) fn transfer(&self) -> Transfer {
+    pub fn transfer(&self) -> Transfer {
         self.transfer
     }
 
@@ -133,14 +138,14 @@ impl Picture {
     }
 
     /// The bytes of a tile, row by row, as the picture's file holds them.
-    fn encode_tile(&self, tile: &TilePixels<'_>) -> Result<Vec<u8>, PutError> {
+    pub(crate) fn encode_tile(&self, tile: &TilePixels<'_>) -> Result<Vec<u8>, PutError> {
         assert!(self.window.has(tile.area), "the area is one of the picture's");
         tile.check()?;
         Ok(self.format.encode(tile.bytes, self.transfer))
     }
 
     /// Writes tiles as the picture's file holds them.
-    fn write(&self, mut tiles: Vec<(Area, Vec<u8>)>) -> io::Result<()> {
+    pub(crate) fn write(&self, mut tiles: Vec<(Area, Vec<u8>)>) -> io::Result<()> {
         tiles.sort_unstable_by_key(|(area, _)| (area.rows().start, area.x0()));
         let is_beside = |(left, _): &(Area, _), (right, _): &(Area, _)| {
             left.rows() == right.rows() && left.columns().end == right.x0()
@@ -158,11 +163,25 @@ impl Picture {
             let row_bytes = bytes.len() / rows.len();
             let at_once = if row_bytes == self.row_bytes() { bytes.len() } else { row_bytes };
             for (y, run) in rows.zip(bytes.chunks_exact(at_once)) {
-                let offset = self.offset(x0 - self.window.x0(), y - self.window.y0());
-                self.file.write_all_at(run, offset)?;
+                self.disk.write_at(&self.file, run, self.offset_in_frame(x0, y))?;
             }
         }
         Ok(())
+    }
+
+    /// The bytes of `area`, row by row.
+    pub(crate) fn read_area(&self, area: Area) -> io::Result<Vec<u8>> {
+        let mut bytes = vec![0; area.pixel_count() * self.format.bytes_per_pixel()];
+        let row_bytes = area.width() as usize * self.format.bytes_per_pixel();
+        for (y, row) in area.rows().zip(bytes.chunks_exact_mut(row_bytes)) {
+            self.file.read_exact_at(row, self.offset_in_frame(area.x0(), y))?;
+        }
+        Ok(bytes)
+    }
+
+    /// Makes what was written outlive a power cut.
+    pub(crate) fn sync(&self) -> io::Result<()> {
+        self.file.sync_data()
     }
 
     /// Writes the whole picture as a file of its format. The same picture gives the same bytes.
@@ -187,9 +206,26 @@ impl Picture {
         self.window.width() as usize * self.format.bytes_per_pixel()
     }
 
+    /// Where the file has a pixel of the frame.
+    fn offset_in_frame(&self, x: u32, y: u32) -> u64 {
+        self.offset(x - self.window.x0(), y - self.window.y0())
+    }
+
     fn offset(&self, x: u32, y: u32) -> u64 {
         let pixels = u64::from(y) * u64::from(self.window.width()) + u64::from(x);
         pixels * self.format.bytes_per_pixel() as u64
+    }
+}
+
+/// Gives an empty file its length, and reserves its bytes where the file system can.
+pub(crate) fn reserve(file: &File, byte_count: u64) -> io::Result<()> {
+    loop {
+        match fallocate(file, FallocateFlags::empty(), 0, byte_count) {
+            Ok(()) => return Ok(()),
+            Err(Errno::OPNOTSUPP) => return file.set_len(byte_count),
+            Err(Errno::INTR) => {}
+            Err(error) => return Err(error.into()),
+        }
     }
 }
 

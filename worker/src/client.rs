@@ -10,7 +10,7 @@ use rtfarm_proto::{
 use tonic::{Code, Status, transport::Channel};
 
 use crate::{
-    call::{Answer, Call, CallError, CallErrorKind, Delivery, Membership, Next, Run},
+    call::{Answer, Call, CallError, CallErrorKind, Delivery, KeptTiles, Membership, Next, Run},
     config::Config,
     job::{Job, JobError},
 };
@@ -40,6 +40,8 @@ pub(crate) fn introduction(config: &Config, nonce: u64) -> wire::JoinRequest {
         isa: config.isa.to_string(),
         host: rustix::system::uname().nodename().to_string_lossy().into_owned(),
         process: std::process::id(),
+        build: config.build.clone(),
+        reference: config.reference.map(|hash| hash.to_vec().into()).unwrap_or_default(),
     }
 }
 
@@ -62,12 +64,16 @@ pub(crate) async fn ask(
             let farm = farm.map_err(|_| JobError::from(WireError::Missing("farm")))?;
             Ok(Answer::Joined { member, farm, term })
         }
-        Call::Lease { member, most_tiles, wait } => {
+        Call::Lease { member, most_tiles, wait, kept } => {
             let request = wire::LeaseRequest {
                 worker: member.worker.0,
                 incarnation: member.incarnation.0,
                 max_tiles: u32::try_from(most_tiles).unwrap_or(u32::MAX),
                 wait_ms: u32::try_from(wait.as_millis()).unwrap_or(u32::MAX),
+                kept: kept.map(|KeptTiles { job, tiles }| wire::KeptTiles {
+                    job: job.0,
+                    tiles: tiles.iter().map(|tile| tile.number()).collect(),
+                }),
             };
             let answer = client.lease(request).await?.into_inner();
             Ok(Answer::Leased(read_next(answer, member.incarnation)?))

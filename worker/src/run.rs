@@ -243,7 +243,7 @@ impl Shell {
         self.pool.spawn_fifo(move || {
             let started = Instant::now();
             let mut on_progress = || {
-                pulse.beat(lease);
+                pulse.beat((lease, Some(tile)));
                 if is_stopped.load(Ordering::Relaxed) {
                     ControlFlow::Break(())
                 } else {

@@ -253,14 +253,20 @@ impl Tasks {
         self.actions.extend(stopped.map(|(&task, _)| Action::Stop(task)));
     }
 
-    /// Stops everything; nobody waits for any report any more.
-    pub(crate) fn stop_all(&mut self) {
+    /// Stops everything; nobody waits for any report any more. Answers with the calls that were not
+    /// answered.
+    pub(crate) fn stop_all(&mut self) -> Vec<Call> {
         self.timers.clear();
         self.silent_since = None;
+        let mut unanswered = Vec::new();
         for (task, stopped) in std::mem::take(&mut self.begun) {
             if !matches!(stopped, Task::Failed(_)) {
                 self.actions.push_back(Action::Stop(task));
             }
+            if let Task::Asked { attempts, .. } | Task::Failed(attempts) = stopped {
+                unanswered.push(attempts.call);
+            }
         }
+        unanswered
     }
 }

@@ -10,13 +10,14 @@ use std::{
 };
 
 use rtfarm_core::{prepared::SceneHash, tile::TileId};
-use rtfarm_proto::{Address, DELIVERY_BYTES, LONGEST_WAIT, LeaseName, Renewal};
+use rtfarm_proto::{Address, DELIVERY_BYTES, FarmId, JobId, LONGEST_WAIT, LeaseName, Renewal};
 
 use crate::{
-    call::{Answer, Call, CallError, CallErrorKind, Delivery, Membership, Next, Run},
+    call::{Answer, Call, CallError, CallErrorKind, Delivery, KeptTiles, Membership, Next, Run},
     config::Config,
     error::WorkerError,
     job::Job,
+    pulse::Object,
     scene::SceneError,
     task::{Action, GivenUp, Rendered, TURN, TaskId, Tasks},
 };
@@ -50,10 +51,16 @@ pub(crate) struct Worker {
     coordinator: Address,
     threads: usize,
     tasks: Tasks,
+    /// The farm that it last joined, and pixels that it rendered for an earlier start of that farm.
+    farm: Option<FarmId>,
+    kept: Kept,
     stage: Stage,
     /// Set when this worker only finishes what its threads have in hand: until when it may.
     drain_until: Option<Instant>,
 }
+
+/// Finished tiles that no coordinator has acknowledged.
+type Kept = BTreeMap<(JobId, TileId), Delivery>;
 
 #[derive(Debug)]
 enum Stage {
@@ -84,6 +91,8 @@ struct Member {
     rendering_count: usize,
     /// Tiles that wait to be delivered.
     rendered: VecDeque<Delivery>,
+    /// Tiles whose pixels wait to be leased once more.
+    kept: Kept,
     /// Tiles on their way to the coordinator, which has not acknowledged them yet.
     delivering_count: usize,
     is_leasing: bool,
@@ -95,10 +104,12 @@ struct Member {
 struct Held {
     /// Tiles that are not on their way to the coordinator yet: at least one.
     tiles_left: usize,
-    /// Signs of progress under it.
+    /// Steps that brought its scene.
     work: u64,
-    /// Those of them that the coordinator was told of.
-    told: u64,
+    /// Tiles of those left that were begun, and the steps that were made for each.
+    begun: BTreeMap<TileId, u64>,
+    /// There were steps of which the coordinator was not told yet.
+    has_news: bool,
 }
 
 #[derive(Debug)]
@@ -118,6 +129,8 @@ impl Worker {
             coordinator: config.coordinator.clone(),
             threads: config.threads,
             tasks,
+            farm: None,
+            kept: Kept::new(),
             stage: Stage::Joining,
             drain_until: None,
         }
@@ -142,7 +155,12 @@ impl Worker {
                 let (worker, coordinator) = (member.worker.0, &self.coordinator);
                 tracing::info!(worker, %coordinator, %farm, "joined");
                 self.tasks.push(Action::HearBeats { period: term / BEATS_A_TERM });
-                self.stage = Stage::Working(Member::new(member, self.threads));
+                // Another farm's jobs have the same numbers.
+                if self.farm.replace(farm) != Some(farm) {
+                    self.kept.clear();
+                }
+                let kept = mem::take(&mut self.kept);
+                self.stage = Stage::Working(Member { kept, ..Member::new(member, self.threads) });
             }
             (Stage::Working(member), Answer::Leased(next)) => {
                 member.is_leasing = false;
@@ -151,8 +169,12 @@ impl Worker {
                     Next::Nothing => {}
                     Next::ShutDown => {
                         tracing::info!(worker = member.id.worker.0, "sent home");
-                        self.end(Ok(()));
+                        return self.end(Ok(()));
                     }
+                }
+                // What was offered and not leased is not wanted.
+                if let Call::Lease { kept: Some(offered), .. } = call {
+                    member.kept.retain(|(job, _), _| *job != offered.job);
                 }
             }
             (Stage::Working(member), Answer::Renewed { lost }) => {
@@ -214,12 +236,14 @@ impl Worker {
         }
     }
 
-    /// Event: threads or a fetch have made so much progress under leases since the last time.
-    pub(crate) fn on_beat(&mut self, beats: &BTreeMap<LeaseName, u64>, now: Instant) {
+    /// Event: threads or a fetch have made so many steps since the last time.
+    pub(crate) fn on_beat(&mut self, beats: &BTreeMap<Object, u64>, now: Instant) {
         if let Stage::Working(member) = &mut self.stage {
-            for (lease, count) in beats {
-                if let Some(held) = member.leases.get_mut(lease) {
-                    held.work += count;
+            for (&(lease, tile), count) in beats {
+                if let Some(held) = member.leases.get_mut(&lease) {
+                    *tile.map_or(&mut held.work, |tile| held.begun.entry(tile).or_default()) +=
+                        count;
+                    held.has_news = true;
                 }
             }
             self.proceed(now);
@@ -258,7 +282,7 @@ impl Worker {
             (Call::Connect, _) => WorkerError::Connect(self.coordinator.clone(), message),
             (Call::Join, CallErrorKind::Refused) => WorkerError::Refused(message),
             (Call::Join, _) => WorkerError::Gone(message),
-            (_, CallErrorKind::NotMember) => return self.join_again(&message, now),
+            (_, CallErrorKind::NotMember) => return self.join_again(call, &message, now),
             (_, CallErrorKind::Nonsense) => WorkerError::Nonsense(message),
             _ => WorkerError::Gone(message),
         };
@@ -269,14 +293,21 @@ impl Worker {
     }
 
     /// The coordinator does not know this worker any more, nor its leases: it may have been started
-    /// anew. What was rendered for those leases is of no use.
-    fn join_again(&mut self, reason: &str, now: Instant) {
+    /// anew. Finished tiles are kept, for the same farm may lease them once more.
+    fn join_again(&mut self, unheard: Call, reason: &str, now: Instant) {
         tracing::warn!(reason, "joining again");
-        self.tasks.stop_all();
+        let unheard = self.tasks.stop_all().into_iter().chain([unheard]);
         if let Stage::Working(member) = mem::replace(&mut self.stage, Stage::Joining) {
             for scene in member.scenes {
                 self.tasks.push(Action::ForgetScene(scene));
             }
+            let delivered = unheard.filter_map(|call| match call {
+                Call::Deliver { tiles, .. } => Some(tiles),
+                _ => None,
+            });
+            self.kept = member.kept;
+            let tiles = member.rendered.into_iter().chain(delivered.flatten());
+            self.kept.extend(tiles.map(|tile| ((tile.lease.job, tile.tile), tile)));
         }
         if self.drain_until.is_some() {
             return self.end(Ok(()));
@@ -334,18 +365,30 @@ impl Member {
             turn: 1,
             rendering_count: 0,
             rendered: VecDeque::new(),
+            kept: Kept::new(),
             delivering_count: 0,
             is_leasing: false,
             is_renewing: false,
         }
     }
 
-    fn on_run(&mut self, run: Run, tasks: &mut Tasks) {
+    fn on_run(&mut self, mut run: Run, tasks: &mut Tasks) {
         if run.tiles.is_empty() {
             return;
         }
-        let held = Held { tiles_left: run.tiles.len(), work: 0, told: 0 };
-        self.leases.insert(run.lease, held);
+        let (tiles_left, begun) = (run.tiles.len(), BTreeMap::new());
+        let held = Held { tiles_left, work: 0, begun, has_news: false };
+        let lease = run.lease;
+        self.leases.insert(lease, held);
+        run.tiles.retain(|&tile| {
+            let kept = self.kept.remove(&(lease.job, tile));
+            let is_kept = kept.is_some();
+            self.rendered.extend(kept.map(|kept| Delivery { lease, ..kept }));
+            !is_kept
+        });
+        if run.tiles.is_empty() {
+            return;
+        }
         if self.scenes.contains(&run.job.scene) {
             self.queue(run);
         } else {
@@ -410,7 +453,7 @@ impl Member {
             tiles.extend(self.rendered.pop_front());
         }
         for tile in &tiles {
-            self.on_tile_sent(tile.lease);
+            self.on_tile_sent(tile.lease, tile.tile);
         }
         self.delivering_count += tiles.len();
         tiles
@@ -442,14 +485,20 @@ impl Member {
             self.is_leasing = true;
             let longest = LONGEST_RUN_A_THREAD.max(LONGEST_RUN_IN_TURNS * self.turn);
             let most_tiles = longest * self.threads;
-            tasks.call(Call::Lease { member: self.id, most_tiles, wait: LONGEST_WAIT }, now);
+            let kept = self.kept.keys().next().map(|&(job, _)| KeptTiles {
+                job,
+                tiles: self.kept.keys().filter(|key| key.0 == job).map(|key| key.1).collect(),
+            });
+            let wait = LONGEST_WAIT;
+            tasks.call(Call::Lease { member: self.id, most_tiles, wait, kept }, now);
         }
-        let has_news = self.leases.values().any(|held| held.work > held.told);
+        let has_news = self.leases.values().any(|held| held.has_news);
         if has_news && !self.is_renewing {
             self.is_renewing = true;
             let renewals = self.leases.iter_mut().map(|(&lease, held)| {
-                held.told = held.work;
-                Renewal { lease, work: held.work }
+                held.has_news = false;
+                let tiles = held.begun.iter().map(|(tile, &work)| (tile.number(), work));
+                Renewal { lease, work: held.work, tiles: tiles.collect() }
             });
             let renewals = renewals.collect();
             tasks.call(Call::Renew { member: self.id, renewals }, now);
@@ -466,9 +515,10 @@ impl Member {
         self.rendering_count < TURNS_AT_HAND * turns && pixels < MOST_TURNS_OF_PIXELS * turns
     }
 
-    fn on_tile_sent(&mut self, name: LeaseName) {
+    fn on_tile_sent(&mut self, name: LeaseName, tile: TileId) {
         if let Some(held) = self.leases.get_mut(&name) {
             held.tiles_left -= 1;
+            held.begun.remove(&tile);
             if held.tiles_left == 0 {
                 self.leases.remove(&name);
             }

@@ -13,7 +13,6 @@ use rayon::prelude::*;
 
 use super::{
     flat::{FlatFaces, bounds_of},
-    planes::normal_of,
     ranks::Ranks,
 };
 use crate::exact::clip::clip;
@@ -161,7 +160,7 @@ struct Plane<'a> {
 
 impl<'a> Plane<'a> {
     fn of(flat: &'a FlatFaces, face: usize) -> Self {
-        Self { corners: flat.corners_of(face), normal: normal_of(flat, face) }
+        Self { corners: flat.corners_of(face), normal: flat.normal(face) }
     }
 
     /// Whether rounding cannot tell the plane from that of another face, of which `point` is one.
@@ -346,7 +345,9 @@ mod tests {
 
     fn sets(places: &[(f64, f64)]) -> Vec<Vec<usize>> {
         let mut sets = near_sets(&squares(places), &Ranks { firsts: Vec::new() }, |_| None);
-        sets.iter_mut().for_each(|set| set.sort_unstable());
+        for set in &mut sets {
+            set.sort_unstable();
+        }
         sets
     }
 

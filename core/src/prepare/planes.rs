@@ -9,8 +9,7 @@ use glam::DVec3;
 use rayon::prelude::*;
 
 use super::{
-    flat::FlatFaces, near_planes::near_sets, newell::unit_normal,
-    plane_fingerprint::plane_fingerprints, ranks::Ranks,
+    flat::FlatFaces, near_planes::near_sets, plane_fingerprint::plane_fingerprints, ranks::Ranks,
 };
 use crate::{
     exact::predicates::is_coplanar,
@@ -133,7 +132,7 @@ impl Sharing<'_> {
         let plane = plane_of(self.flat, *group.peek().expect("a group has a face"));
         let index = self.planes.len();
         for face in group {
-            let is_reversed = normal_of(self.flat, face).dot(DVec3::from_array(plane.normal)) < 0.0;
+            let is_reversed = self.flat.normal(face).dot(DVec3::from_array(plane.normal)) < 0.0;
             self.of_faces[face] = Some(PlaneIndex::new(index, is_reversed));
         }
         self.planes.push(plane);
@@ -150,16 +149,5 @@ fn plane_of(flat: &FlatFaces, face: usize) -> PlaneRecord {
         let from_first: DVec3 = corners.iter().map(|&corner| corner - corners[0]).sum();
         corners[0] + from_first / corners.len() as f64
     };
-    PlaneRecord { point: point.to_array(), normal: normal_of(flat, face).to_array() }
-}
-
-/// The unit normal of a flat face.
-pub(super) fn normal_of(flat: &FlatFaces, face: usize) -> DVec3 {
-    match face.checked_sub(flat.count() - flat.box_edges.len()) {
-        Some(of_box) => {
-            let [u, v] = flat.box_edges[of_box];
-            unit_normal(&[DVec3::ZERO, u, v])
-        }
-        None => unit_normal(flat.corners_of(face)),
-    }
+    PlaneRecord { point: point.to_array(), normal: flat.normal(face).to_array() }
 }

@@ -102,6 +102,8 @@ impl Bench {
             threads,
             isa: rtfarm_core::isa::Isa::fastest(),
             version: "1".to_owned(),
+            build: String::new(),
+            reference: None,
             patience,
         };
         let now = start();
@@ -138,8 +140,18 @@ impl Bench {
     }
 
     fn join(&mut self, worker: u32) {
-        let joined = Answer::Joined { member: member(worker), farm: FarmId([7; 16]), term: TERM };
+        self.join_farm(worker, 1);
+    }
+
+    fn join_farm(&mut self, worker: u32, farm: u8) {
+        let joined =
+            Answer::Joined { member: member(worker), farm: FarmId([farm; 16]), term: TERM };
         self.answer(|call| matches!(call, Call::Join), joined);
+    }
+
+    /// A call that waits for its answer.
+    fn asked(&self, is_it: fn(&Call) -> bool) -> Call {
+        self.calls.values().find(|call| is_it(call)).expect("it is asked").clone()
     }
 
     /// Takes the worker's actions, and checks what always holds.
@@ -244,9 +256,16 @@ impl Bench {
         (lease, tile)
     }
 
-    /// A sign of progress under a lease.
+    /// A step that brings the scene of a lease.
     fn beat(&mut self, number: u64) {
-        self.worker.on_beat(&BTreeMap::from([(lease(number), 1)]), self.now);
+        self.worker.on_beat(&BTreeMap::from([((lease(number), None), 1)]), self.now);
+        self.absorb();
+    }
+
+    /// A step for a tile of a lease.
+    fn step(&mut self, number: u64, tile: u32) {
+        let tile = grid().tile(tile);
+        self.worker.on_beat(&BTreeMap::from([((lease(number), tile), 1)]), self.now);
         self.absorb();
     }
 
@@ -269,7 +288,8 @@ fn a_tile_goes_from_its_lease_to_its_delivery() {
     assert_eq!(bench.beat_period, Some(TERM / 4));
     let asked = bench.answer(is_lease, run(1, 1, 0));
     let (member, wait) = (member(1), LONGEST_WAIT);
-    assert_eq!(asked, Call::Lease { member, most_tiles: LONGEST_RUN_A_THREAD, wait });
+    let most_tiles = LONGEST_RUN_A_THREAD;
+    assert_eq!(asked, Call::Lease { member, most_tiles, wait, kept: None });
     assert!(bench.calls.is_empty(), "nothing is asked for while a scene is fetched");
     bench.fetch();
     assert!(bench.has(is_lease), "one tile is too few to go on with");
@@ -380,20 +400,31 @@ fn pixels_are_kept_until_they_are_acknowledged() {
 }
 
 #[test]
-fn progress_renews_its_own_lease_one_renewal_at_a_time() {
-    let mut bench = Bench::rendering(1, 1);
+fn progress_is_told_tile_by_tile_one_renewal_at_a_time() {
+    let mut bench = Bench::rendering(2, 2);
     bench.answer(is_lease, run(2, 9, 0));
     assert!(!bench.has(is_renew), "time alone renews nothing");
-    bench.beat(1);
-    bench.beat(1);
+    bench.step(1, 0);
+    bench.step(1, 0);
+    bench.step(1, 1);
     bench.beat(2);
-    for works in [[1, 0], [2, 1]] {
+    let mut check_renewal = |expected: [(u64, &[(u32, u64)]); 2]| {
         let renewed = bench.answer(is_renew, Answer::Renewed { lost: vec![] });
-        let renewal = |(number, work)| Renewal { lease: lease(number), work };
-        let renewals = (1..).zip(works).map(renewal).collect();
-        assert_eq!(renewed, Call::Renew { member: member(1), renewals });
-    }
+        let renewals = (1..).zip(expected).map(|(number, (work, tiles))| Renewal {
+            lease: lease(number),
+            work,
+            tiles: tiles.to_vec(),
+        });
+        assert_eq!(renewed, Call::Renew { member: member(1), renewals: renewals.collect() });
+    };
+    check_renewal([(0, &[(0, 1)]), (0, &[])]);
+    check_renewal([(0, &[(0, 2), (1, 1)]), (1, &[])]);
     assert!(!bench.has(is_renew), "nothing new to tell");
+    bench.render();
+    bench.step(1, 1);
+    let renewed = bench.answer(is_renew, Answer::Renewed { lost: vec![] });
+    let Call::Renew { renewals, .. } = renewed else { panic!("{renewed:?}") };
+    assert_eq!(renewals[0].tiles, [(1, 2)], "what is on its way is told no more");
 }
 
 #[test]
@@ -508,7 +539,7 @@ fn a_forgotten_worker_stops_everything_and_joins_again() {
     assert_eq!(bench.stopped.len(), bench.renderings.len());
     assert!(bench.scenes.is_empty());
     assert_eq!(bench.calls.values().collect::<Vec<_>>(), [&Call::Join]);
-    bench.join(2);
+    bench.join_farm(2, 2);
     bench.worker.on_answer(late, Answer::Delivered, bench.now);
     while !bench.renderings.is_empty() {
         bench.render();
@@ -529,7 +560,7 @@ fn a_coordinator_started_anew_gets_no_pixel_that_was_rendered_for_the_last() {
     // One delivery is repeated, one is on its way, when the coordinator says that it is another.
     bench.fail(is_deliver, no_answer());
     bench.fail(is_deliver, failure(CallErrorKind::NotMember));
-    bench.join(2);
+    bench.join_farm(2, 2);
     while !bench.renderings.is_empty() {
         bench.render();
     }
@@ -537,6 +568,35 @@ fn a_coordinator_started_anew_gets_no_pixel_that_was_rendered_for_the_last() {
     while bench.exit.is_none() {
         assert!(!bench.has(is_deliver) && !bench.has(is_renew));
         bench.sleep();
+    }
+}
+
+#[test]
+fn finished_tiles_are_delivered_to_the_same_farm_under_a_new_lease() {
+    for is_same in [true, false] {
+        let mut bench = Bench::rendering(2, 9);
+        let ((_, first), (_, second)) = (bench.render(), bench.render());
+        bench.fail(is_deliver, no_answer());
+        bench.fail(is_deliver, failure(CallErrorKind::NotMember));
+        bench.join_farm(2, if is_same { 1 } else { 2 });
+        let Call::Lease { kept, .. } = bench.asked(is_lease) else { unreachable!() };
+        let mut tiles = vec![first, second];
+        tiles.sort();
+        let offered = KeptTiles { job: JobId(1), tiles };
+        assert_eq!(kept, is_same.then_some(offered));
+
+        // One of them was leased to another meanwhile.
+        let run = Run { lease: lease(7), tiles: vec![second], job: job(0) };
+        bench.answer(is_lease, Answer::Leased(Next::Run(run)));
+        if is_same {
+            let Call::Deliver { tiles, .. } = bench.asked(is_deliver) else { unreachable!() };
+            assert_eq!(tiles, [delivery(lease(7), second)]);
+            let Call::Lease { kept, .. } = bench.asked(is_lease) else { unreachable!() };
+            assert_eq!(kept, None);
+            assert!(bench.fetches.is_empty(), "nothing is to be rendered");
+        } else {
+            assert!(!bench.has(is_deliver) && bench.fetches.len() == 1, "it is rendered anew");
+        }
     }
 }
 
@@ -586,6 +646,8 @@ fn workers_do_not_all_ask_again_at_once() {
         threads: 1,
         isa: rtfarm_core::isa::Isa::fastest(),
         version: "1".to_owned(),
+        build: String::new(),
+        reference: None,
         patience: PATIENCE,
     };
     let now = start();
@@ -906,7 +968,7 @@ fn simulate(seed: u64) {
                 bench.worker.on_tiles_rendered(vec![(task, pixels)], bench.now);
             }
             Letter::Beat(lease) => {
-                bench.worker.on_beat(&BTreeMap::from([(lease, 1)]), bench.now);
+                bench.worker.on_beat(&BTreeMap::from([((lease, None), 1)]), bench.now);
             }
         }
         bench.absorb();
