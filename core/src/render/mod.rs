@@ -46,12 +46,10 @@ pub fn render_tile<B: AsRef<[u8]>>(
     let mut sampler = Sampler::new(&view, quality, isa, on_progress);
     let ControlFlow::Continue(pixels) = sampler.sample(area) else { return None };
     let mut tally = sampler.tally();
-    for pixel in &pixels {
-        if let Some(variance) = pixel.variance() {
-            tally.estimated += 1;
-            tally.variance += (variance.x + variance.y + variance.z) / 3.0;
-        }
+    for variance in pixels.iter().filter_map(|&(_, variance)| variance) {
+        tally.estimated += 1;
+        tally.variance += (variance.x + variance.y + variance.z) / 3.0;
     }
-    let pixels = pixels.iter().map(|pixel| pixel.mean().to_array().map(|x| x as f32)).collect();
+    let pixels = pixels.iter().map(|(mean, _)| mean.to_array().map(|x| x as f32)).collect();
     Some(RenderedTile { pixels, tally })
 }

@@ -4,19 +4,53 @@ use glam::DVec3;
 
 use crate::sample::{FEWEST_FOR_ERROR, RUNS};
 
-/// The samples that a pixel has received.
+/// The samples that a pixel has received, a sum for each run.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct Runs {
+    sums: [DVec3; RUNS as usize],
+    count: u32,
+}
+
+impl Runs {
+    /// Takes in what the next sample saw: they come in the order of their numbers.
+    pub(super) fn add(&mut self, color: DVec3) {
+        self.sums[(self.count % RUNS) as usize] += color;
+        self.count += 1;
+    }
+
+    /// The mean of all samples.
+    pub(super) fn mean(&self) -> DVec3 {
+        let [a, b, c, d] = self.sums;
+        ((a + b) + (c + d)) / f64::from(self.count)
+    }
+
+    /// The estimated variance of the mean, per channel, from how far the means of the runs lie
+    /// apart: unbiased. `None` with too few samples.
+    pub(super) fn variance(&self) -> Option<DVec3> {
+        (self.count >= FEWEST_FOR_ERROR).then(|| {
+            let mean = self.mean();
+            let total = f64::from(self.count);
+            let mut sum = DVec3::ZERO;
+            for (run, &of_run) in (0..).zip(&self.sums) {
+                let share = f64::from((self.count + RUNS - 1 - run) / RUNS);
+                let difference = (of_run - share * mean) / total;
+                sum += difference * difference;
+            }
+            sum * (f64::from(RUNS) / f64::from(RUNS - 1))
+        })
+    }
+}
+
+/// A pixel that gets samples until its error is small, and what tells that error.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Pixel {
-    /// The sum of each run of samples.
-    sums: [DVec3; RUNS as usize],
+    runs: Runs,
     /// The sum of the samples' squares.
     squares: DVec3,
     /// The least and the largest sample, channel by channel.
     range: [DVec3; 2],
-    count: u32,
-    /// How far apart the first samples of the pixel and its neighbours lie, once the neighbours
-    /// have been looked at.
-    contrast: Option<DVec3>,
+    /// How far apart the first samples of the pixel and its neighbours lie.
+    contrast: DVec3,
     /// The variance that faces add which no sample has met.
     unseen: DVec3,
 }
@@ -38,11 +72,10 @@ const EVEN: f64 = 4.0;
 impl Default for Pixel {
     fn default() -> Self {
         Self {
-            sums: [DVec3::ZERO; RUNS as usize],
+            runs: Runs::default(),
             squares: DVec3::ZERO,
             range: [DVec3::INFINITY, DVec3::NEG_INFINITY],
-            count: 0,
-            contrast: None,
+            contrast: DVec3::ZERO,
             unseen: DVec3::ZERO,
         }
     }
@@ -51,21 +84,19 @@ impl Default for Pixel {
 impl Pixel {
     /// Takes in what the next sample saw: they come in the order of their numbers.
     pub(super) fn add(&mut self, color: DVec3) {
-        self.sums[(self.count % RUNS) as usize] += color;
+        self.runs.add(color);
         self.squares += color * color;
         self.range = [self.range[0].min(color), self.range[1].max(color)];
-        self.count += 1;
     }
 
     /// How many samples there are.
     pub(super) fn count(&self) -> u32 {
-        self.count
+        self.runs.count
     }
 
     /// The mean of all samples.
     pub(super) fn mean(&self) -> DVec3 {
-        let [a, b, c, d] = self.sums;
-        ((a + b) + (c + d)) / f64::from(self.count)
+        self.runs.mean()
     }
 
     /// The least and the largest sample, channel by channel.
@@ -75,7 +106,7 @@ impl Pixel {
 
     /// Notes how far apart the first samples of the pixel and its neighbours lie.
     pub(super) fn set_contrast(&mut self, contrast: DVec3) {
-        self.contrast = Some(contrast);
+        self.contrast = contrast;
     }
 
     /// Notes the variance that faces add to the mean which no sample has met.
@@ -83,44 +114,24 @@ impl Pixel {
         self.unseen = variance;
     }
 
-    /// The estimated variance of the mean, per channel; `None` with too few samples.
-    pub(super) fn variance(&self) -> Option<DVec3> {
-        (self.count >= FEWEST_FOR_ERROR).then(|| match self.contrast {
-            Some(contrast) => self.careful_variance(contrast),
-            None => self.variance_of_runs(),
-        })
-    }
-
     /// Whether the estimated standard error is below `error` in each channel.
     pub(super) fn is_below(&self, error: f64) -> bool {
         self.variance().is_some_and(|variance| variance.max_element() < error * error)
     }
 
-    /// The variance of the mean, from how far the means of the runs lie apart: unbiased.
-    fn variance_of_runs(&self) -> DVec3 {
-        let mean = self.mean();
-        let total = f64::from(self.count);
-        let mut sum = DVec3::ZERO;
-        for (run, &of_run) in (0..).zip(&self.sums) {
-            let share = f64::from((self.count + RUNS - 1 - run) / RUNS);
-            let difference = (of_run - share * mean) / total;
-            sum += difference * difference;
-        }
-        sum * (f64::from(RUNS) / f64::from(RUNS - 1))
-    }
-
-    /// The variance to decide by. Four runs agree by chance now and then, and whoever stops there
-    /// is wrong. So their variance, which is worth three numbers, counts as much as that of an
-    /// edge with the same samples, and what the neighbours met and this pixel did not yet is added,
-    /// and what nobody met.
-    fn careful_variance(&self, contrast: DVec3) -> DVec3 {
-        let n = f64::from(self.count);
+    /// The estimated variance of the mean, per channel, to decide by; `None` with too few samples.
+    /// Four runs agree by chance now and then, and whoever stops there is wrong. So their variance,
+    /// which is worth three numbers, counts as much as that of an edge with the same samples, and
+    /// what the neighbours met and this pixel did not yet is added, and what nobody met.
+    pub(super) fn variance(&self) -> Option<DVec3> {
+        let of_runs = self.runs.variance()?;
+        let n = f64::from(self.count());
         let mean = self.mean();
         let variance = (self.squares / n - mean * mean).max(DVec3::ZERO) * (n / (n - 1.0));
         let of_edge = variance * (EDGE / (n * n.sqrt()));
-        let missed = (contrast - EVEN * (self.range[1] - self.range[0])).max(DVec3::ZERO);
+        let missed = (self.contrast - EVEN * (self.range[1] - self.range[0])).max(DVec3::ZERO);
         let of_contrast = missed * missed * (UNSEEN / (n * n * n));
-        (self.variance_of_runs() + of_edge) / 2.0 + of_contrast + self.unseen
+        Some((of_runs + of_edge) / 2.0 + of_contrast + self.unseen)
     }
 }
 
@@ -137,11 +148,11 @@ mod tests {
     #[test]
     fn the_variance_of_runs_is_that_of_their_means() {
         // Runs 1 5, 2 6, 3 7, 4 8: means 3, 4, 5, 6 with the variance 5/3.
-        let eight = pixel([1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0]);
+        let eight = pixel([1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0]).runs;
         assert_eq!(eight.mean(), DVec3::splat(4.5));
         assert!((eight.variance().unwrap().x - 5.0 / 3.0 / 4.0).abs() < 1e-15);
-        assert_eq!(pixel([1.0; 7]).variance(), None);
-        assert_eq!(pixel([1.0; 9]).variance(), Some(DVec3::ZERO));
+        assert_eq!(pixel([1.0; 7]).runs.variance(), None);
+        assert_eq!(pixel([1.0; 9]).runs.variance(), Some(DVec3::ZERO));
     }
 
     #[test]
@@ -160,7 +171,7 @@ mod tests {
     fn runs_that_agree_by_chance_do_not_close_a_pixel() {
         let mut edge = pixel([0.0, 0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 1.0]);
         edge.set_contrast(DVec3::ONE);
-        assert_eq!(edge.variance_of_runs(), DVec3::ZERO);
+        assert_eq!(edge.runs.variance(), Some(DVec3::ZERO));
         assert!(!edge.is_below(8.0 / 255.0));
     }
 }

@@ -1,11 +1,11 @@
 //! How many samples pixels get, and when.
 
-use std::ops::ControlFlow;
+use std::ops::{ControlFlow, Range};
 
 use glam::DVec3;
 
 use super::{
-    pixel::Pixel,
+    pixel::{Pixel, Runs},
     settings::{Quality, Sampling},
     tally::Tally,
     unseen::{FirstSamples, UnseenFaces, UnseenSearch},
@@ -48,8 +48,9 @@ impl<'a> Sampler<'a> {
         self.tally
     }
 
-    /// Gives the pixels of `area` all their samples. `Break` when the work was stopped.
-    pub(super) fn sample(&mut self, area: Area) -> ControlFlow<(), Vec<Pixel>> {
+    /// Gives the pixels of `area` all their samples: their means, and the estimated variances of
+    /// these where there are enough samples. `Break` when the work was stopped.
+    pub(super) fn sample(&mut self, area: Area) -> ControlFlow<(), Vec<(DVec3, Option<DVec3>)>> {
         match self.quality.sampling {
             Sampling::Fixed(count) => self.sample_evenly(area, count.get()),
             Sampling::Adaptive { error, most } => {
@@ -59,11 +60,17 @@ impl<'a> Sampler<'a> {
     }
 
     /// The pixels of `area` with `count` samples each.
-    fn sample_evenly(&mut self, area: Area, count: u32) -> ControlFlow<(), Vec<Pixel>> {
-        let mut pixels = vec![Pixel::default(); area.pixel_count()];
-        let all: Vec<u32> = (0..pixels.len() as u32).collect();
-        self.extend(area, &mut pixels, &all, count, None)?;
-        ControlFlow::Continue(pixels)
+    fn sample_evenly(
+        &mut self,
+        area: Area,
+        count: u32,
+    ) -> ControlFlow<(), Vec<(DVec3, Option<DVec3>)>> {
+        let all: Vec<u32> = (0..area.pixel_count() as u32).collect();
+        let mut pixels = vec![Runs::default(); all.len()];
+        self.extend(area, &all, 0..count, None, |pixel, color| {
+            pixels[pixel as usize].add(color);
+        })?;
+        ControlFlow::Continue(pixels.iter().map(|runs| (runs.mean(), runs.variance())).collect())
     }
 
     /// The pixels of `area` with samples until each one's standard error is below `error`.
@@ -72,13 +79,15 @@ impl<'a> Sampler<'a> {
         area: Area,
         error: f64,
         most: u32,
-    ) -> ControlFlow<(), Vec<Pixel>> {
+    ) -> ControlFlow<(), Vec<(DVec3, Option<DVec3>)>> {
         let wide = area.with_rim();
         let inner: Vec<u32> = area.pixels().map(|(x, y)| wide.index_of(x, y)).collect();
         let mut pixels = vec![Pixel::default(); wide.pixel_count()];
         let all: Vec<u32> = (0..pixels.len() as u32).collect();
         let mut hits = Vec::with_capacity(all.len() * FEWEST_FOR_ERROR as usize);
-        self.extend(wide, &mut pixels, &all, FEWEST_FOR_ERROR, Some(&mut hits))?;
+        self.extend(wide, &all, 0..FEWEST_FOR_ERROR, Some(&mut hits), |pixel, color| {
+            pixels[pixel as usize].add(color);
+        })?;
 
         // What one pixel's first samples missed its neighbours' may have found.
         let contrasts: Vec<DVec3> = inner
@@ -105,13 +114,19 @@ impl<'a> Sampler<'a> {
         open.retain(|&pixel| is_open(&pixels, pixel));
         let mut count = FEWEST_FOR_ERROR;
         while !open.is_empty() && count < most {
-            count = most.min(2 * count);
-            self.extend(wide, &mut pixels, &open, count, None)?;
+            let next = most.min(2 * count);
+            self.extend(wide, &open, count..next, None, |pixel, color| {
+                pixels[pixel as usize].add(color);
+            })?;
+            count = next;
             watch.note_samples(wide, &mut pixels, quality.seed);
             open.retain(|&pixel| is_open(&pixels, pixel));
         }
         self.tally.capped += open.len() as u64;
-        ControlFlow::Continue(inner.iter().map(|&pixel| pixels[pixel as usize]).collect())
+        let sampled = |&pixel: &u32| &pixels[pixel as usize];
+        ControlFlow::Continue(
+            inner.iter().map(sampled).map(|pixel| (pixel.mean(), pixel.variance())).collect(),
+        )
     }
 
     /// Finds the faces in the pixels of `area` that none of the first samples has met; `hits` has
@@ -147,42 +162,42 @@ impl<'a> Sampler<'a> {
         ControlFlow::Continue(UnseenWatch { search: Some(search), found })
     }
 
-    /// Brings the `chosen` ones among the pixels of `area`, which all have as many samples, to
-    /// `count` samples each; `hits` takes what the new camera rays meet.
+    /// Gives each of the `chosen` pixels of `area` the samples of these numbers; `add` takes what
+    /// they see, pixel by pixel in order, and `hits` what their camera rays meet.
     fn extend(
         &mut self,
         area: Area,
-        pixels: &mut [Pixel],
         chosen: &[u32],
-        count: u32,
+        numbers: Range<u32>,
         mut hits: Option<&mut Vec<Hit>>,
+        mut add: impl FnMut(u32, DVec3),
     ) -> ControlFlow<()> {
-        let seed = self.quality.seed;
-        let had = chosen.first().map_or(0, |&pixel| pixels[pixel as usize].count());
-        let each = u64::from(count - had);
-        let wanted = chosen.len() as u64 * each;
-        let pixel_of = |index: u64| chosen[(index / each) as usize];
+        let (count, seed) = (numbers.end, self.quality.seed);
         let width = 1.0 / f64::from(count).sqrt();
-        for first in (0..wanted).step_by(BATCH) {
-            let run = first..wanted.min(first + BATCH as u64);
-            let samples = run.clone().map(|index| {
-                let pixel = pixel_of(index);
-                let (x, y) = area.pixel_at(pixel);
-                let number = had + (index % each) as u32;
-                let sample = Samples::new(count, seed, x, y).sample(number);
-                CameraSample { x, y, sample, width }
-            });
-            self.wavefront.start(self.view, self.quality, area.frame(), samples);
-            self.tally.samples += run.end - run.start;
-            self.tally.rays +=
-                self.wavefront.run(self.view, self.quality, self.isa, self.on_progress)?;
-            for (index, &color) in run.zip(self.wavefront.colors()) {
-                pixels[pixel_of(index) as usize].add(color);
+        for pixels in chosen.chunks((BATCH / numbers.len()).max(1)) {
+            for first in numbers.clone().step_by(BATCH) {
+                let part = first..count.min(first + BATCH as u32);
+                let samples = pixels.iter().flat_map(|&pixel| {
+                    let (x, y) = area.pixel_at(pixel);
+                    let samples = Samples::new(count, seed, x, y);
+                    part.clone().map(move |number| {
+                        let sample = samples.sample(number);
+                        CameraSample { x, y, sample, width }
+                    })
+                });
+                self.wavefront.start(self.view, self.quality, area.frame(), samples);
+                self.tally.samples += (pixels.len() * part.len()) as u64;
+                self.tally.rays +=
+                    self.wavefront.run(self.view, self.quality, self.isa, self.on_progress)?;
+                let of_pixels = self.wavefront.colors().chunks_exact(part.len());
+                for (&pixel, colors) in pixels.iter().zip(of_pixels) {
+                    colors.iter().for_each(|&color| add(pixel, color));
+                }
+                if let Some(hits) = &mut hits {
+                    hits.extend_from_slice(self.wavefront.first_hits());
+                }
+                self.tally.cut = self.tally.cut.max(self.wavefront.most_untraced());
             }
-            if let Some(hits) = &mut hits {
-                hits.extend_from_slice(self.wavefront.first_hits());
-            }
-            self.tally.cut = self.tally.cut.max(self.wavefront.most_untraced());
         }
         ControlFlow::Continue(())
     }
