@@ -5,7 +5,7 @@ use std::{fmt, ops::RangeInclusive, path::PathBuf, str::FromStr, time::Duration}
 use clap::{Args as ClapArgs, Parser, Subcommand, ValueEnum, value_parser};
 use rtfarm_core::{
     isa::{Isa, IsaError},
-    render::{Cutoff, Quality, SampleCount, SampleLimit, Sampling, StandardError},
+    render::{Quality, SampleCount, SampleLimit, Sampling, StandardError},
     tile::{Crop, Size, SizeError, TileGrid},
     transfer::Transfer,
 };
@@ -145,11 +145,6 @@ pub(crate) struct PictureArgs {
     #[arg(long)]
     flat: bool,
 
-    /// Mirrored and transmitted light that counts less than this in its sample is taken for
-    /// background.
-    #[arg(long, value_name = "WEIGHT", default_value_t = Cutoff::DEFAULT, value_parser = parse_cutoff)]
-    cutoff: Cutoff,
-
     /// Whether surfaces that mirror light others.
     #[arg(long, value_name = "on|off", default_value = "on", hide_possible_values = true)]
     secondary: Switch,
@@ -178,6 +173,11 @@ pub(crate) struct RenderArgs {
     /// --max-samples, and tells them.
     #[arg(long, value_name = "S", value_parser = parse_seconds, conflicts_with_all = ["samples", "error", "max_samples"])]
     pub(crate) time: Option<Duration>,
+
+    /// Go on with what an earlier render with --resume left when it was interrupted, however that was.
+    /// The folder FILE.rtfarm has it until the picture is there.
+    #[arg(long, conflicts_with = "time")]
+    pub(crate) resume: bool,
 
     /// Worker processes; 0 renders in this one. Default: 2, or 1 on a single core.
     #[arg(long, value_name = "N", value_parser = value_parser!(u16).range(0..=256))]
@@ -214,14 +214,23 @@ pub(crate) struct CoordinatorArgs {
     #[arg(long)]
     pub(crate) insecure: bool,
 
-    /// The folder for scenes and pictures under way; the system's folder for temporary files by
-    /// default.
-    #[arg(long, value_name = "FOLDER")]
+    /// Keep the farm's jobs and pictures in this folder, which is made if there is none: a coordinator
+    /// that is started on it again goes on with them. Without it they end with the coordinator.
+    #[arg(long, value_name = "DIR")]
     pub(crate) state: Option<PathBuf>,
+
+    /// Lose no finished tile in a power cut; otherwise those of the last second may be rendered again.
+    #[arg(long, requires = "state")]
+    pub(crate) durable: bool,
 
     /// A worker that makes no progress for this long loses its tiles to others.
     #[arg(long, value_name = "S", default_value = "4", value_parser = parse_seconds)]
     pub(crate) lease_seconds: Duration,
+
+    /// How much of what a worker renders another renders again, to find out who lies, from 0 to 1;
+    /// besides, each worker's first tile of a picture. 0 compares nothing.
+    #[arg(long, value_name = "FRACTION", default_value = "0.01", value_parser = parse_fraction)]
+    pub(crate) audit: f64,
 
     /// How log lines are written.
     #[arg(long, value_name = "FORMAT", default_value = "text")]
@@ -271,6 +280,10 @@ pub(crate) struct SubmitArgs {
     /// Where the coordinator is: `http://host:7878` or `unix:/path/socket`.
     #[arg(long, value_name = "URL")]
     pub(crate) coordinator: Address,
+
+    /// How long to go on without a coordinator once it has the job.
+    #[arg(long, value_name = "S", default_value = "60", value_parser = parse_seconds)]
+    pub(crate) patience: Duration,
 
     /// How log lines are written.
     #[arg(long, value_name = "FORMAT", default_value = "text")]
@@ -358,7 +371,6 @@ impl PictureArgs {
                 seed: self.seed,
                 flat: self.flat,
                 secondary: matches!(self.secondary, Switch::On),
-                cutoff: self.cutoff,
             },
             crop: self.crop,
             tile_side: self.tile,
@@ -443,11 +455,6 @@ fn parse_transfer(text: &str) -> Result<Transfer, String> {
     }
 }
 
-fn parse_cutoff(text: &str) -> Result<Cutoff, &'static str> {
-    let cutoff = text.parse().ok().and_then(Cutoff::new);
-    cutoff.ok_or("a weight must be a number from 0 to 1")
-}
-
 fn parse_seconds(text: &str) -> Result<Duration, String> {
     let seconds: f64 = text.parse().map_err(|_| "a number of seconds is wanted")?;
     if (0.1..=86_400.0).contains(&seconds) {
@@ -455,6 +462,11 @@ fn parse_seconds(text: &str) -> Result<Duration, String> {
     } else {
         Err("a time is from 0.1 to 86400 seconds".to_owned())
     }
+}
+
+fn parse_fraction(text: &str) -> Result<f64, &'static str> {
+    let fraction = text.parse().ok().filter(|fraction| (0.0..=1.0).contains(fraction));
+    fraction.ok_or("a fraction is a number from 0 to 1")
 }
 
 #[cfg(test)]

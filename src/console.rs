@@ -205,12 +205,13 @@ impl Write for LineWriter {
 
 impl Drop for LineWriter {
     fn drop(&mut self) {
-        let line = match std::mem::take(&mut self.line) {
-            line if self.is_drawn => line,
-            line => plain(&String::from_utf8_lossy(&line)).into_bytes(),
-        };
+        let mut line = std::mem::take(&mut self.line);
+        let is_plain = |&byte: &u8| matches!(byte, b' '..=b'~' | b'\n' | b'\t');
+        if !self.is_drawn && !line.iter().all(is_plain) {
+            line = plain(&String::from_utf8_lossy(&line)).into_bytes();
+        }
         match &self.console.lines {
-            Some(lines) => lines.push(line),
+            Some(lines) => lines.push(&line),
             None => write_above(self.console.lock().clone().as_ref(), &line),
         }
     }

@@ -50,7 +50,7 @@ async fn fetch(args: &ImageArgs, send: mpsc::Sender<wire::Chunk>) -> Result<(), 
     let refused = |status: Status| anyhow!("the coordinator says: {}", plain(status.message()));
     let client = timeout(DEADLINE, reach(address)).await.map_err(late)?;
     let mut client = client.with_context(|| format!("no coordinator answers at {address}"))?;
-    let image = client.image(wire::ImageRequest { job: args.job, incarnation: 0 });
+    let image = client.image(wire::ImageRequest { job: args.job, ..wire::ImageRequest::default() });
     let image = timeout(IMAGE_DEADLINE, image).await.map_err(late)?;
     let mut chunks = image.map_err(refused)?.into_inner();
     loop {

@@ -15,6 +15,7 @@ mod plain;
 mod private_folder;
 mod render;
 mod report;
+mod resume;
 mod scene_files;
 mod source;
 mod submission;
@@ -35,6 +36,9 @@ use crate::{
 
 /// The version that both ends of a farm must have.
 const VERSION: &str = env!("CARGO_PKG_VERSION");
+
+/// Of the sources that pixels depend on, which coordinator and workers must share; see `build.rs`.
+const BUILD: &str = env!("RTFARM_BUILD");
 
 fn main() -> ExitCode {
     let args = match Args::try_parse() {

@@ -47,6 +47,13 @@ impl Output {
         self.format
     }
 
+    /// The path of something that belongs to the picture and stands beside it.
+    pub(crate) fn beside(&self, extension: &str) -> PathBuf {
+        let mut path = self.path.clone().into_os_string();
+        path.push(extension);
+        path.into()
+    }
+
     /// The folder that the picture will be in.
     pub(crate) fn folder(&self) -> PathBuf {
         folder_of(&self.path)

@@ -10,18 +10,18 @@ use anyhow::{Context, anyhow};
 use rtfarm_coordinator::{Config, Coordinator, Job, Listener};
 use rtfarm_core::{
     language::draw_diagnostics,
-    render::{Sampling, Tally},
+    render::{DEEPEST, Sampling, Tally},
     tile::Size,
     transfer::Transfer,
 };
 use rtfarm_job::{Order, Outcome, Progress, Refusal};
-use rtfarm_picture::Picture;
+use rtfarm_picture::{Canvas, Picture};
 use rtfarm_proto::Address;
 use tokio::{net::UnixListener, sync::watch, task::spawn_blocking, time::Instant};
 use tokio_util::sync::CancellationToken;
 
 use crate::{
-    VERSION,
+    BUILD, VERSION,
     args::{PictureArgs, RenderArgs},
     children::{Children, Setup},
     console::Console,
@@ -31,6 +31,7 @@ use crate::{
     output::Output,
     pilot,
     private_folder::PrivateFolder,
+    resume::{Begun, Resume},
     scene_files::SceneFiles,
     source::SceneText,
 };
@@ -48,13 +49,14 @@ pub(crate) struct Summary {
 }
 
 impl Summary {
-    /// What there is to say of branches that were not traced.
-    fn cut_text(&self) -> String {
-        if self.tally.cut > 0.0 {
-            format!(", at most {:.2} % of a sample cut off", 100.0 * self.tally.cut)
-        } else {
-            String::new()
+    /// What there is to say of light that lies too deep.
+    fn depth_text(&self) -> String {
+        let Tally { samples, untraced, most_untraced, .. } = self.tally;
+        if untraced == 0.0 {
+            return String::new();
         }
+        let [mean, most] = [untraced / samples as f64, most_untraced].map(|share| 100.0 * share);
+        format!(", {mean:.2} % deeper than {DEEPEST} rays (at most {most:.2} % of a sample)")
     }
 
     /// How far off the picture may be.
@@ -81,7 +83,7 @@ impl Summary {
         let mrays = self.tally.rays as f64 / 1e6;
         writeln!(
             io::stdout().lock(),
-            "{size} in {seconds:.2} s, {mrays:.1} Mrays, {rate:.1} Mrays/s, {workers} {noun}, {samples:.1} samples a pixel, {error}{cut}: {path}",
+            "{size} in {seconds:.2} s, {mrays:.1} Mrays, {rate:.1} Mrays/s, {workers} {noun}, {samples:.1} samples a pixel, {error}{depth}: {path}",
             size = self.size,
             seconds = started.elapsed().as_secs_f64(),
             rate = mrays / self.rendering.as_secs_f64().max(1e-9),
@@ -89,7 +91,7 @@ impl Summary {
             noun = if self.workers == 1 { "worker" } else { "workers" },
             samples = self.tally.samples as f64 / self.size.pixel_count() as f64,
             error = self.error_text(),
-            cut = self.cut_text(),
+            depth = self.depth_text(),
             path = output.name().display()
         )
         .context("cannot write to standard output")
@@ -109,10 +111,16 @@ pub(crate) async fn run(
     if let Some(time) = args.time {
         order = choose_quality(order, time, &args, stop).await?;
     }
+    let (order, begun, resume) = begin(order, &output, args.resume).await?;
     let summary = match args.workers_and_threads() {
-        (0, threads) => render_here(order, threads, &args, &output, console, stop).await?,
-        workers => render_with_workers(order, workers, &args, &output, console, stop).await?,
+        (0, threads) => render_here(order, begun, threads, &args, &output, console, stop).await?,
+        workers => {
+            render_with_workers(order, begun, workers, &args, &output, console, stop).await?
+        }
     };
+    if let Some(resume) = resume {
+        resume.remove()?;
+    }
     summary.tell(started, &output)?;
     if let Some(time) = args.time {
         let over = summary.rendering.as_secs_f64() / time.as_secs_f64() - 1.0;
@@ -180,8 +188,29 @@ async fn place(
     })
 }
 
+/// Begins a picture, or takes it up where an earlier process was interrupted.
+async fn begin(
+    order: Order,
+    output: &Output,
+    may_resume: bool,
+) -> Result<(Order, Begun, Option<Resume>), Failure> {
+    let output = output.clone();
+    let beginning = spawn_blocking(move || -> anyhow::Result<_> {
+        if may_resume {
+            let (resume, begun) = Resume::open(&output, &order)?;
+            return Ok((order, begun, Some(resume)));
+        }
+        let folder = output.folder();
+        let canvas = Canvas::new_in(&folder, order.grid, order.format, order.transfer)
+            .with_context(|| format!("cannot make the picture's file in {}", folder.display()))?;
+        Ok((order, (canvas, Vec::new()), None))
+    });
+    Ok(beginning.await??)
+}
+
 async fn render_here(
     order: Order,
+    (canvas, done): Begun,
     threads: usize,
     args: &RenderArgs,
     output: &Output,
@@ -195,9 +224,9 @@ async fn render_here(
     let mut shown = progress.subscribe();
     let bar = console.start_bar(tile_count);
     let rendering = spawn_blocking({
-        let (folder, isa, stop) = (output.folder(), args.isa.0, stop.clone());
+        let (isa, stop) = (args.isa.0, stop.clone());
         move || {
-            let rendered = local::render(order, &folder, (threads, isa), &progress, &stop);
+            let rendered = local::render(order, canvas, &done, (threads, isa), &progress, &stop);
             let tally = progress.borrow().tally;
             rendered.map(|rendered| (rendered, tally))
         }
@@ -209,15 +238,16 @@ async fn render_here(
     };
     let (rendered, ()) = tokio::join!(rendering, show);
     drop(bar);
-    let (Some((picture, rendering)), tally) = rendered?? else {
+    let (Some((canvas, rendering)), tally) = rendered?? else {
         return Err(Failure::Interrupted);
     };
-    write_picture(output, stop, move |write| write(&picture)).await?;
+    write_picture(output, stop, move |write| write(canvas.picture())).await?;
     Ok(Summary { size, tally, sampling, transfer, rendering, workers: 0 })
 }
 
 async fn render_with_workers(
     order: Order,
+    (canvas, done): Begun,
     (workers, threads): (usize, usize),
     args: &RenderArgs,
     output: &Output,
@@ -231,14 +261,18 @@ async fn render_with_workers(
         .with_context(|| format!("cannot listen on {}", socket.display()))?;
     let coordinator = Coordinator::new(Config {
         version: VERSION.to_owned(),
+        build: BUILD.to_owned(),
+        // The workers are this very program on this machine: nobody here has a reason to lie.
+        reference: None,
         term: args.lease_seconds,
+        audit: 0.0,
         upload_silence: UPLOAD_SILENCE,
         scene_folder: folder.path().to_owned(),
         picture_folder: output.folder(),
     })?;
     let job = spawn_blocking({
         let coordinator = coordinator.clone();
-        move || coordinator.submit(order)
+        move || coordinator.submit_on(order, canvas, &done)
     });
     let job = job.await??;
     let stop_serving = CancellationToken::new();

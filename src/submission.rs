@@ -93,6 +93,8 @@ pub(crate) enum Trouble {
     Connect(Address, String),
     /// The coordinator says why it does not do what was asked.
     Call(String),
+    /// The connection has failed.
+    Lost(String),
     /// A deadline has passed.
     Late,
     /// A stream has ended before its end.
@@ -110,6 +112,7 @@ impl fmt::Display for Trouble {
                 write!(f, "no coordinator answers at {address}: {reason}")
             }
             Self::Call(reason) => write!(f, "the coordinator says: {reason}"),
+            Self::Lost(reason) => write!(f, "the connection to the coordinator is lost: {reason}"),
             Self::Late => f.write_str("the coordinator does not answer"),
             Self::Gone => f.write_str("the coordinator is gone"),
             Self::Nonsense(reason) => {
@@ -135,12 +138,23 @@ const IMAGE_DEADLINE: Duration = Duration::from_secs(600);
 /// The longest that a piece of the picture may be on its way.
 const CHUNK_DEADLINE: Duration = Duration::from_secs(30);
 
+/// The pause before a coordinator that is gone is looked for. It doubles each time, up to
+/// [`LONGEST_PAUSE`].
+const FIRST_PAUSE: Duration = Duration::from_millis(100);
+
+const LONGEST_PAUSE: Duration = Duration::from_secs(2);
+
 /// A client's side of one job.
 #[derive(Debug)]
 pub(crate) struct Submission {
     /// What the scene is called in messages.
     scene: String,
     coordinator: Address,
+    /// How long a coordinator that has the job may be gone.
+    patience: Duration,
+    /// When it was last heard of, if it is gone.
+    gone_since: Option<Instant>,
+    pause: Duration,
     stage: Stage,
     /// When what is being done must have come further.
     deadline: Option<Instant>,
@@ -159,6 +173,12 @@ enum Stage {
         job: JobId,
         finished: Finished,
     },
+    /// The coordinator was gone and is looked for, after a pause.
+    Reconnecting {
+        job: JobId,
+        size: Size,
+        is_pausing: bool,
+    },
     /// The job is being forgotten; then the submission ends so.
     Cancelling {
         end: Result<Finished, Failure>,
@@ -168,9 +188,22 @@ enum Stage {
 
 impl Submission {
     /// A submission that begins to look for the coordinator.
-    pub(crate) fn new(scene: String, coordinator: Address, now: Instant) -> Self {
-        let (stage, actions) = (Stage::Ended, VecDeque::new());
-        let mut submission = Self { scene, coordinator, stage, deadline: None, actions };
+    pub(crate) fn new(
+        scene: String,
+        coordinator: Address,
+        patience: Duration,
+        now: Instant,
+    ) -> Self {
+        let mut submission = Self {
+            scene,
+            coordinator,
+            patience,
+            gone_since: None,
+            pause: FIRST_PAUSE,
+            stage: Stage::Ended,
+            deadline: None,
+            actions: VecDeque::new(),
+        };
         submission.enter(Stage::Connecting, Action::Connect, now + DEADLINE);
         submission
     }
@@ -187,8 +220,14 @@ impl Submission {
 
     /// Event: the coordinator was reached.
     pub(crate) fn on_connected(&mut self, now: Instant) {
-        if let Stage::Connecting = self.stage {
-            self.enter(Stage::Submitting, Action::Submit, now + SUBMIT_DEADLINE);
+        match self.stage {
+            Stage::Connecting => {
+                self.enter(Stage::Submitting, Action::Submit, now + SUBMIT_DEADLINE);
+            }
+            Stage::Reconnecting { job, size, .. } => {
+                self.enter(Stage::Watching { job, size }, Action::Watch(job), now + DEADLINE);
+            }
+            _ => {}
         }
     }
 
@@ -220,6 +259,7 @@ impl Submission {
     /// Event: the job has come further.
     pub(crate) fn on_job_state(&mut self, state: JobState, now: Instant) {
         let Stage::Watching { job, size } = self.stage else { return };
+        (self.gone_since, self.pause) = (None, FIRST_PAUSE);
         self.actions.push_back(Action::Show(state.clone()));
         match state.end {
             None => {}
@@ -279,13 +319,43 @@ impl Submission {
                      --coordinator {coordinator} -o FILE fetches it"
                 ))));
             }
+            (&Stage::Watching { job, size } | &Stage::Reconnecting { job, size, .. }, trouble) => {
+                self.find_again((job, size), trouble, now);
+            }
+            (Stage::Fetching { job, finished }, trouble) => {
+                self.find_again((*job, finished.size), trouble, now);
+            }
             (_, trouble) => self.give_up(Failure::Other(anyhow::Error::msg(trouble)), now),
         }
     }
 
+    /// Looks for a coordinator that has a job and is gone, unless it was gone for too long. One that
+    /// keeps its jobs will have it.
+    fn find_again(&mut self, (job, size): (JobId, Size), trouble: Trouble, now: Instant) {
+        let may_be_gone = matches!(
+            trouble,
+            Trouble::Connect(..) | Trouble::Lost(_) | Trouble::Late | Trouble::Gone
+        );
+        let until = *self.gone_since.get_or_insert(now) + self.patience;
+        let again_at = now + self.pause;
+        if !may_be_gone || until <= again_at {
+            return self.give_up(Failure::Other(anyhow::Error::msg(trouble)), now);
+        }
+        self.pause = LONGEST_PAUSE.min(self.pause * 2);
+        self.stage = Stage::Reconnecting { job, size, is_pausing: true };
+        self.deadline = Some(again_at);
+    }
+
     /// Event: time passes.
     pub(crate) fn on_tick(&mut self, now: Instant) {
-        if self.deadline.is_some_and(|deadline| deadline <= now) {
+        if self.deadline.is_none_or(|deadline| now < deadline) {
+            return;
+        }
+        if let Stage::Reconnecting { job, size, is_pausing: true } = self.stage {
+            let reconnecting = Stage::Reconnecting { job, size, is_pausing: false };
+            let patient_until = self.gone_since.map_or(now, |since| since + self.patience);
+            self.enter(reconnecting, Action::Connect, patient_until.min(now + DEADLINE));
+        } else {
             self.on_trouble(Trouble::Late, now);
         }
     }
@@ -308,7 +378,9 @@ impl Submission {
     fn give_up(&mut self, failure: Failure, now: Instant) {
         match self.stage {
             Stage::Connecting | Stage::Submitting => self.end(Err(failure)),
-            Stage::Watching { job, .. } | Stage::Fetching { job, .. } => {
+            Stage::Watching { job, .. }
+            | Stage::Fetching { job, .. }
+            | Stage::Reconnecting { job, .. } => {
                 self.cancel(job, Err(failure), now);
             }
             Stage::Cancelling { .. } | Stage::Ended => {}
@@ -338,6 +410,7 @@ mod tests {
 
     const JOB: JobId = JobId(7);
     const SECOND: Duration = Duration::from_secs(1);
+    const PATIENCE: Duration = Duration::from_secs(20);
 
     #[expect(clippy::disallowed_methods, reason = "any instant will do")]
     fn start() -> Instant {
@@ -376,7 +449,8 @@ mod tests {
     impl Bench {
         fn connecting() -> Self {
             let now = start();
-            Self { submission: Submission::new("scene.rt".to_owned(), coordinator(), now), now }
+            let scene = "scene.rt".to_owned();
+            Self { submission: Submission::new(scene, coordinator(), PATIENCE, now), now }
         }
 
         fn submitting() -> Self {
@@ -491,12 +565,62 @@ mod tests {
     }
 
     #[test]
-    fn lost_events_end_the_job() {
+    fn a_coordinator_that_is_gone_is_found_again() {
+        let lost = || Trouble::Lost("broken pipe".to_owned());
+        for mut bench in [Bench::watching(), Bench::fetching()] {
+            bench.actions();
+            bench.submission.on_trouble(Trouble::Gone, bench.now);
+            bench.check_actions(&[]);
+            assert_eq!(bench.sleep(), FIRST_PAUSE);
+            bench.check_actions(&["Connect"]);
+            bench
+                .submission
+                .on_trouble(Trouble::Connect(coordinator(), "refused".to_owned()), bench.now);
+            assert_eq!(bench.sleep(), FIRST_PAUSE * 2);
+            bench.check_actions(&["Connect"]);
+            bench.submission.on_connected(bench.now);
+            bench.check_actions(&["Watch(JobId(7))"]);
+            bench.submission.on_trouble(lost(), bench.now);
+            assert_eq!(bench.sleep(), FIRST_PAUSE * 4);
+            bench.submission.on_connected(bench.now);
+            bench.check_actions(&["Connect", "Watch(JobId(7))"]);
+            bench.submission.on_watching();
+            bench.submission.on_job_state(state(None), bench.now);
+            bench.submission.on_trouble(lost(), bench.now);
+            assert_eq!(bench.sleep(), FIRST_PAUSE, "it was there again");
+        }
+    }
+
+    #[test]
+    fn a_coordinator_that_stays_away_is_given_up() {
+        let mut bench = Bench::watching();
+        bench.submission.on_trouble(Trouble::Gone, bench.now);
+        let gone_at = bench.now;
+        loop {
+            bench.sleep();
+            if bench.actions().0.iter().any(|name| name.starts_with("Cancel")) {
+                break;
+            }
+        }
+        let waited = bench.now - gone_at;
+        assert!(PATIENCE < waited + LONGEST_PAUSE && waited <= PATIENCE, "{waited:?}");
+        bench.submission.on_trouble(Trouble::Gone, bench.now);
+        bench.check_failed(&[], 1, "the coordinator does not answer");
+    }
+
+    #[test]
+    fn what_a_coordinator_says_is_not_asked_again() {
         let mut bench = Bench::watching();
         bench.submission.on_job_state(state(None), bench.now);
+        bench.submission.on_trouble(Trouble::Call("there is no such job".to_owned()), bench.now);
         bench.submission.on_trouble(Trouble::Gone, bench.now);
-        bench.submission.on_trouble(Trouble::Call("not heard".to_owned()), bench.now);
-        bench.check_failed(&["Show(4)", "Cancel(JobId(7))"], 1, "the coordinator is gone");
+        let message = "the coordinator says: there is no such job";
+        bench.check_failed(&["Show(4)", "Cancel(JobId(7))"], 1, message);
+        let mut bench = Bench::watching();
+        bench.submission.on_trouble(Trouble::Gone, bench.now);
+        bench.submission.on_stop(bench.now);
+        bench.submission.on_cancelled();
+        bench.check_failed(&["Cancel(JobId(7))"], 130, "interrupted");
     }
 
     #[test]
@@ -556,8 +680,10 @@ mod tests {
             [(opening, DEADLINE), (Bench::fetching(), IMAGE_DEADLINE), (reading, CHUNK_DEADLINE)]
         {
             assert_eq!(bench.sleep(), deadline);
+            assert_eq!(bench.sleep(), FIRST_PAUSE, "it has the job");
+            bench.submission.on_stop(bench.now);
             assert_eq!(bench.sleep(), CANCEL_DEADLINE, "nor for its farewell");
-            bench.check_failed(&["Cancel(JobId(7))"], 1, message);
+            bench.check_failed(&["Connect", "Cancel(JobId(7))"], 130, "interrupted");
         }
     }
 

@@ -3,6 +3,7 @@
 
 use std::{
     collections::BTreeMap,
+    error::Error,
     future::pending,
     io::{self, Write},
     ops::ControlFlow,
@@ -13,7 +14,7 @@ use anyhow::Context;
 use rtfarm_core::{render::Tally, tile::Size};
 use rtfarm_job::Progress;
 use rtfarm_proto::{
-    Address, CHUNK_BYTES, Incarnation, JobId, MESSAGE_BYTES, PROTOCOL, WireError,
+    Address, Bytes, CHUNK_BYTES, JobId, MESSAGE_BYTES, PROTOCOL, WireError,
     wire::{self, event, jobs_client::JobsClient, submit_request::Part, submit_response},
 };
 use tokio::{
@@ -23,7 +24,7 @@ use tokio::{
 };
 use tokio_stream::wrappers::ReceiverStream;
 use tokio_util::sync::CancellationToken;
-use tonic::{Status, Streaming, transport::Channel};
+use tonic::{Code, Status, Streaming, transport::Channel};
 
 use crate::{
     VERSION,
@@ -50,7 +51,7 @@ pub(crate) async fn run(
     output.check()?;
     let text = SceneText::read(&args.picture.scene, stop).await?;
     let mut submission =
-        Submission::new(args.picture.scene.name(), args.coordinator.clone(), now());
+        Submission::new(args.picture.scene.name(), args.coordinator.clone(), args.patience, now());
     let mut shell = Shell {
         args: &args,
         output: &output,
@@ -58,7 +59,7 @@ pub(crate) async fn run(
         stop,
         text: Some(text),
         client: None,
-        incarnation: Incarnation(0),
+        farm: Bytes::new(),
         reports: mpsc::channel(1).1,
         running: None,
         writing: None,
@@ -96,8 +97,8 @@ struct Shell<'a> {
     /// The scene's text until it is sent.
     text: Option<SceneText>,
     client: Option<JobsClient<Channel>>,
-    /// The start of the coordinator that took the order.
-    incarnation: Incarnation,
+    /// The id of the farm that took the order.
+    farm: Bytes,
     /// What the running task tells.
     reports: mpsc::Receiver<Report>,
     running: Option<JoinHandle<()>>,
@@ -109,7 +110,7 @@ struct Shell<'a> {
 /// What a task tells.
 enum Report {
     Connected(JobsClient<Channel>),
-    Submitted(Submitted, Incarnation),
+    Submitted(Submitted, Bytes),
     Watching,
     JobState(JobState),
     ChunkAwaited,
@@ -180,7 +181,7 @@ impl Shell<'_> {
             }
             Action::TellReport(report) => self.console.tell_report(&report),
             Action::Watch(job) => {
-                let request = wire::WatchRequest { job: job.0, incarnation: self.incarnation.0 };
+                let request = wire::WatchRequest { job: job.0, farm: self.farm.clone() };
                 let client = self.client();
                 self.start(|reports| watch(client, request, reports));
             }
@@ -194,14 +195,14 @@ impl Shell<'_> {
             }
             Action::Fetch(job) => {
                 let (send, chunks) = mpsc::channel(2);
-                let request = wire::ImageRequest { job: job.0, incarnation: self.incarnation.0 };
+                let request = wire::ImageRequest { job: job.0, farm: self.farm.clone() };
                 let client = self.client();
                 let reports = self.start(|reports| fetch(client, request, send, reports));
                 self.writing = Some(write(self.output.clone(), self.stop.clone(), chunks, reports));
             }
             Action::Cancel(job) => {
                 let mut client = self.client();
-                let request = wire::CancelRequest { job: job.0, incarnation: self.incarnation.0 };
+                let request = wire::CancelRequest { job: job.0, farm: self.farm.clone() };
                 self.start(|reports| async move {
                     let cancelled = client.cancel(request).await;
                     let report =
@@ -257,8 +258,8 @@ impl Shell<'_> {
                 self.client = Some(client);
                 submission.on_connected(now());
             }
-            Report::Submitted(submitted, incarnation) => {
-                self.incarnation = incarnation;
+            Report::Submitted(submitted, farm) => {
+                self.farm = farm;
                 submission.on_submitted(submitted, now());
             }
             Report::Watching => submission.on_watching(),
@@ -303,8 +304,12 @@ impl Shell<'_> {
     }
 }
 
+/// What a call failed of: the coordinator says it, or the connection.
 fn failed(status: &Status) -> Report {
-    Report::Trouble(Trouble::Call(plain(status.message())))
+    let is_lost = status.source().is_some()
+        || matches!(status.code(), Code::Unavailable | Code::Unknown | Code::Cancelled);
+    let reason = plain(status.message());
+    Report::Trouble(if is_lost { Trouble::Lost(reason) } else { Trouble::Call(reason) })
 }
 
 /// Reaches a coordinator.
@@ -349,7 +354,7 @@ async fn submit(
     });
     match client.submit(ReceiverStream::new(parts)).await {
         Ok(answer) => match read_submitted(answer.into_inner()) {
-            Ok((submitted, incarnation)) => Report::Submitted(submitted, incarnation),
+            Ok((submitted, farm)) => Report::Submitted(submitted, farm),
             Err(error) => nonsense(&error),
         },
         Err(status) => failed(&status),
@@ -459,11 +464,11 @@ fn nonsense(error: &anyhow::Error) -> Report {
     Report::Trouble(Trouble::Nonsense(format!("{error:#}")))
 }
 
-fn read_submitted(answer: wire::SubmitResponse) -> anyhow::Result<(Submitted, Incarnation)> {
-    let mut incarnation = Incarnation(0);
+fn read_submitted(answer: wire::SubmitResponse) -> anyhow::Result<(Submitted, Bytes)> {
+    let mut farm = Bytes::new();
     let outcome = match answer.outcome.context("it has no outcome")? {
         submit_response::Outcome::Accepted(accepted) => {
-            incarnation = Incarnation(accepted.incarnation);
+            farm = accepted.farm;
             SubmitOutcome::Accepted {
                 job: JobId(accepted.job),
                 size: Size::try_from(accepted.frame.ok_or(WireError::Missing("frame"))?)?,
@@ -471,7 +476,7 @@ fn read_submitted(answer: wire::SubmitResponse) -> anyhow::Result<(Submitted, In
         }
         submit_response::Outcome::Refused(reason) => SubmitOutcome::Refused(plain(&reason)),
     };
-    Ok((Submitted { outcome, report: plain(&answer.report) }, incarnation))
+    Ok((Submitted { outcome, report: plain(&answer.report) }, farm))
 }
 
 fn read_event(event: wire::Event) -> anyhow::Result<JobState> {

@@ -5,7 +5,7 @@ use std::time::Duration;
 use rtfarm_worker::{Config, die_with_parent};
 use tokio_util::sync::CancellationToken;
 
-use crate::{args::WorkerArgs, failure::Failure};
+use crate::{BUILD, args::WorkerArgs, failure::Failure};
 
 /// A local worker dies with its coordinator, and waits for one that is merely suspended.
 const LOCAL_PATIENCE: Duration = Duration::from_secs(24 * 3600);
@@ -25,6 +25,8 @@ pub(crate) async fn run(
         patience: if is_local { LOCAL_PATIENCE } else { args.patience },
         coordinator: args.coordinator,
         version: args.claim_version,
+        build: BUILD.to_owned(),
+        reference: (!is_local).then(|| rtfarm_worker::reference(args.isa.0)),
     };
     let grace = args.grace;
     let shutdown = async {

@@ -12,10 +12,11 @@ use rtfarm_job::{Outcome, Progress};
 use rtfarm_proto::{Incarnation, JobId, LONGEST_WAIT, LeaseId, LeaseName, Renewal, WorkerId};
 
 use crate::{
+    audit::Audit,
     identity::{Identity, Stranger},
-    lease::{Leases, Loss, Run},
-    members::{Members, NoMember, Process},
-    tiles::{Arrival, PixelHash, Tiles},
+    lease::{LONGEST_QUIET, Leases, Loss, Run},
+    members::{KeptOut, Members, NoMember, Process},
+    tiles::{Arrival, MOST_LOSSES, PixelHash, Rendering, Tiles},
     waiting::{Ask, AskId, Waiting},
 };
 
@@ -46,13 +47,22 @@ pub(crate) struct Farm {
     stranger_count: u64,
     /// Tiles that came from workers that were never to render them.
     ungranted_count: u64,
+    /// Jobs are there again when the farm is: it may stop before they have ended.
+    keeps_jobs: bool,
     term: Duration,
     members: Members,
     leases: Leases,
     waiting: Waiting,
+    audit: Audit,
+    /// It was said that nobody renders tiles again.
+    is_told_of_no_audit: bool,
     jobs: BTreeMap<JobId, JobState>,
     /// Jobs that have ended and are kept, in the order of their ends.
     ended: VecDeque<JobId>,
+    /// Jobs of which each tile is in the picture or was set aside, since when.
+    finishing: BTreeMap<JobId, Instant>,
+    /// When they are looked at again: what they wait for may never come.
+    look_at: Option<Instant>,
     last_job: JobId,
     phase: Phase,
 }
@@ -61,16 +71,28 @@ pub(crate) struct Farm {
 #[derive(Debug)]
 struct JobState {
     started: Instant,
+    earlier: Earlier,
     progress: Progress,
     contributors: BTreeSet<WorkerId>,
-    /// What its tiles took one thread, together; nobody is believed more than the job's age.
-    thread_time: Duration,
     /// Workers that brought pixels that make no sense. They get no more tiles of this job while
     /// there is another worker.
     suspects: BTreeSet<WorkerId>,
     /// Tiles of which such pixels came: who brought the last, under which lease.
     senseless: BTreeMap<TileId, (WorkerId, LeaseId)>,
     storing: BTreeMap<TileId, Storing>,
+    /// Tiles of which copies differ, and nobody could say which is right.
+    unsettled: BTreeSet<TileId>,
+}
+
+/// What earlier starts of a farm did for a job.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub(crate) struct Earlier {
+    /// How long they were there for it.
+    pub(crate) elapsed: Duration,
+    /// What the tiles in its picture took.
+    pub(crate) tally: Tally,
+    /// Workers that brought some of them.
+    pub(crate) worker_count: u32,
 }
 
 /// A tile whose pixels are on their way into the picture.
@@ -78,8 +100,8 @@ struct JobState {
 struct Storing {
     id: DeliveryId,
     first: Delivery,
-    /// Copies that came meanwhile. They are answered when the first is safe.
-    copies: Vec<DeliveryId>,
+    /// Copies that came meanwhile. They are compared and answered when the first is safe.
+    copies: Vec<(DeliveryId, Delivery)>,
 }
 
 /// What there is to do for a worker that waits.
@@ -87,8 +109,12 @@ struct Storing {
 enum Work {
     /// Free tiles of a job.
     Free(JobId),
+    /// A tile of a job that may be the end of its worker.
+    Suspect(JobId),
     /// A tile of a lease that another worker has.
     Overdue(LeaseId),
+    /// A tile that another worker has rendered, to compare.
+    Audit(JobId, TileId),
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -149,6 +175,8 @@ pub(crate) enum Action {
     Store(DeliveryId, JobId, TileId),
     /// Answer a delivery.
     Acknowledge(DeliveryId, Verdict),
+    /// Forget what is kept of tiles that are not in the picture any more.
+    TakeBack(JobId, Vec<TileId>),
     /// Show those who watch a job how far it is.
     Publish(JobId, Progress),
     /// Drop a job's scene and picture.
@@ -166,13 +194,23 @@ pub(crate) enum Notice {
     Joined(WorkerId, Process),
     /// A worker without leases is gone, for that reason.
     Gone(WorkerId, String),
-    /// A lease is lost, for that reason.
+    /// A lease is lost, or tiles of it, for that reason.
     LeaseLost(Loss, String),
+    /// A tile is rendered no more: too many workers were lost with it in work.
+    SetAside(JobId, TileId),
     /// A tile is in the picture, as the last of those in `progress`, so long after the job's
     /// start.
     TileDone { delivery: Delivery, progress: Progress, elapsed: Duration },
-    /// A second copy of a tile has another hash than the first.
-    CopiesDiffer { second: Delivery, first: PixelHash },
+    /// A further copy of a tile has another hash than what is in the picture.
+    CopiesDiffer { second: Delivery, first: Rendering },
+    /// A worker brought pixels of a tile that two others contradict, and is kept out from now on.
+    Liar { worker: WorkerId, job: JobId, tile: TileId },
+    /// Tiles of a liar are taken out of a picture, to be rendered again.
+    TakenBack { worker: WorkerId, job: JobId, tiles: Vec<TileId> },
+    /// Nobody is there to render tiles again and compare. It is said once.
+    NoAudit,
+    /// A tile is not compared any more: workers were lost with it too often.
+    NotCompared(JobId, TileId),
     /// A job failed, for that reason.
     JobFailed(JobId, String),
     /// A client cancelled a job.
@@ -186,22 +224,57 @@ pub(crate) enum Notice {
     Strangers(u64),
 }
 
+impl JobState {
+    fn new(progress: Progress, earlier: Earlier, now: Instant) -> Self {
+        Self {
+            started: now,
+            earlier,
+            progress,
+            contributors: BTreeSet::new(),
+            suspects: BTreeSet::new(),
+            senseless: BTreeMap::new(),
+            storing: BTreeMap::new(),
+            unsettled: BTreeSet::new(),
+        }
+    }
+
+    /// How long it has been rendered.
+    fn elapsed(&self, now: Instant) -> Duration {
+        self.earlier.elapsed + (now - self.started)
+    }
+}
+
 impl Farm {
     /// Makes a farm without members and jobs. A lease lives for `term` after the last progress.
-    pub(crate) fn new(identity: Identity, term: Duration) -> Self {
+    pub(crate) fn new(identity: Identity, term: Duration, audit: Audit) -> Self {
         Self {
             identity,
             stranger_count: 0,
             ungranted_count: 0,
+            keeps_jobs: false,
             term,
             members: Members::new(LONGEST_SILENCE.max(term)),
             leases: Leases::new(term),
             waiting: Waiting::default(),
+            audit,
+            is_told_of_no_audit: false,
             jobs: BTreeMap::new(),
             ended: VecDeque::new(),
+            finishing: BTreeMap::new(),
+            look_at: None,
             last_job: identity.job_before_first(),
             phase: Phase::Open,
         }
+    }
+
+    /// Makes a farm whose jobs outlive it, of which `last_job` was the last so far.
+    pub(crate) fn keeping_jobs(
+        identity: Identity,
+        term: Duration,
+        audit: Audit,
+        last_job: JobId,
+    ) -> Self {
+        Self { keeps_jobs: true, last_job, ..Self::new(identity, term, audit) }
     }
 
     /// When [`Farm::on_time`] is to be called next, at the latest.
@@ -209,21 +282,20 @@ impl Farm {
         let farewell = if let Phase::Farewell(until) = self.phase { Some(until) } else { None };
         let deadline = self.waiting.next_deadline().map(|(until, _)| until);
         let second = self.next_second_rendering().map(|(from, ..)| from);
-        let times =
-            [self.leases.next_expiry(), self.members.next_check(), deadline, second, farewell];
+        let expiry = self.leases.next_expiry();
+        let times = [expiry, self.members.next_check(), deadline, second, farewell, self.look_at];
         times.into_iter().flatten().min()
     }
 
     /// Event: time passes.
     pub(crate) fn on_time(&mut self, now: Instant) -> Vec<Action> {
         let mut actions = Vec::new();
-        for loss in self.leases.on_time(now) {
-            let reason = format!("no progress for {:.1} s", self.term.as_secs_f64());
-            actions.push(Action::Log(Notice::LeaseLost(loss, reason)));
-        }
+        let losses = self.leases.on_time(now);
+        let reason = format!("no progress for {:.1} s", self.term.as_secs_f64());
+        self.on_losses(losses, &reason, now, &mut actions);
         for worker in self.members.on_time(now) {
             let reason = format!("silent for {} s", LONGEST_SILENCE.max(self.term).as_secs());
-            self.lose_worker(worker, &reason, &mut actions);
+            self.lose_worker(worker, true, &reason, now, &mut actions);
         }
         self.serve(now, &mut actions);
         self.end_farewell(now, &mut actions);
@@ -249,19 +321,21 @@ impl Farm {
     // Members.
 
     /// Event: a process joins. The same nonce gets the same number.
-    pub(crate) fn on_join(&mut self, process: Process, now: Instant) -> (WorkerId, Vec<Action>) {
-        let (worker, is_new) = self.members.on_join(&process, now);
-        let joined = is_new.then_some(Action::Log(Notice::Joined(worker, process)));
-        (worker, joined.into_iter().collect())
+    pub(crate) fn on_join(
+        &mut self,
+        process: Process,
+        now: Instant,
+    ) -> (Result<WorkerId, KeptOut>, Vec<Action>) {
+        match self.members.on_join(&process, now) {
+            Ok((worker, true)) => (Ok(worker), vec![Action::Log(Notice::Joined(worker, process))]),
+            Ok((worker, false)) => (Ok(worker), Vec::new()),
+            Err(kept_out) => (Err(kept_out), Vec::new()),
+        }
     }
 
     /// Event: a worker leaves, for that reason.
     pub(crate) fn on_leave(&mut self, worker: WorkerId, reason: &str, now: Instant) -> Vec<Action> {
-        let mut actions = Vec::new();
-        self.lose_worker(worker, reason, &mut actions);
-        self.serve(now, &mut actions);
-        self.end_farewell(now, &mut actions);
-        actions
+        self.on_worker_gone(worker, false, reason, now)
     }
 
     /// Event: a process on this machine, which may be a worker, has ended for that reason.
@@ -272,21 +346,64 @@ impl Farm {
         now: Instant,
     ) -> Vec<Action> {
         let worker = self.members.in_process(process);
-        worker.map_or_else(Vec::new, |worker| self.on_leave(worker, reason, now))
+        worker.map_or_else(Vec::new, |worker| self.on_worker_gone(worker, true, reason, now))
     }
 
-    fn lose_worker(&mut self, worker: WorkerId, reason: &str, actions: &mut Vec<Action>) {
+    fn on_worker_gone(
+        &mut self,
+        worker: WorkerId,
+        died: bool,
+        reason: &str,
+        now: Instant,
+    ) -> Vec<Action> {
+        let mut actions = Vec::new();
+        self.lose_worker(worker, died, reason, now, &mut actions);
+        self.serve(now, &mut actions);
+        self.end_farewell(now, &mut actions);
+        actions
+    }
+
+    fn lose_worker(
+        &mut self,
+        worker: WorkerId,
+        died: bool,
+        reason: &str,
+        now: Instant,
+        actions: &mut Vec<Action>,
+    ) {
         let was_member = self.members.remove(worker);
         if let Some(ask) = self.waiting.of(worker) {
             self.waiting.remove(ask);
             actions.push(Action::Answer(ask, Err(NoMember(worker))));
         }
-        let losses = self.leases.on_worker_lost(worker);
+        let losses = self.leases.on_worker_lost(worker, died);
         if was_member && losses.is_empty() {
             actions.push(Action::Log(Notice::Gone(worker, reason.to_owned())));
         }
-        let log = |loss| Action::Log(Notice::LeaseLost(loss, reason.to_owned()));
-        actions.extend(losses.into_iter().map(log));
+        self.on_losses(losses, reason, now, actions);
+    }
+
+    fn on_losses(
+        &mut self,
+        losses: Vec<Loss>,
+        reason: &str,
+        now: Instant,
+        actions: &mut Vec<Action>,
+    ) {
+        for loss in losses {
+            let job = loss.lease.job;
+            for &tile in &loss.again {
+                if self.audit.on_loss(job, tile) {
+                    actions.push(Action::Log(Notice::NotCompared(job, tile)));
+                    self.give_up(job, tile);
+                }
+            }
+            let aside = loss.aside.iter().map(|&tile| Notice::SetAside(job, tile));
+            let aside: Vec<Action> = aside.map(Action::Log).collect();
+            actions.push(Action::Log(Notice::LeaseLost(loss, reason.to_owned())));
+            actions.extend(aside);
+            self.finish(job, now);
+        }
     }
 
     // Asking and waiting.
@@ -311,6 +428,25 @@ impl Farm {
         actions
     }
 
+    /// Event: a worker has pixels of these tiles of a job, which it rendered for an earlier start of
+    /// this farm. Those that are free are leased to it, as any tile is.
+    pub(crate) fn on_offer(
+        &mut self,
+        worker: WorkerId,
+        job: JobId,
+        numbers: &[u32],
+        now: Instant,
+    ) -> Option<Run> {
+        self.members.on_sign_of_life(worker, now).ok()?;
+        if self.phase != Phase::Open || !self.may_render(worker, job) {
+            return None;
+        }
+        let grid = self.leases.tiles(job)?.grid();
+        let tiles: Vec<TileId> = numbers.iter().filter_map(|&number| grid.tile(number)).collect();
+        let threads = self.members.threads(worker).0;
+        self.leases.on_offer((worker, threads), job, &tiles, now)
+    }
+
     /// Event: nobody waits for the answer to a question any longer.
     pub(crate) fn on_hang_up(&mut self, ask: AskId) {
         self.waiting.remove(ask);
@@ -327,7 +463,12 @@ impl Farm {
                     let threads = self.members.threads(ask.worker);
                     self.leases.on_idle(ask.worker, job, threads, ask.most, now)
                 }
+                Work::Suspect(job) => self.leases.on_trial(ask.worker, job, now),
                 Work::Overdue(lease) => self.leases.on_idle_at_the_end(ask.worker, lease, now),
+                Work::Audit(job, tile) => {
+                    self.audit.on_lease(job, tile);
+                    self.leases.on_audit(ask.worker, job, tile, now)
+                }
             };
             let run = run.expect("the job has a free tile, or the lease one that is in no other");
             actions.push(Action::Answer(id, Ok(Next::Render(run))));
@@ -346,34 +487,54 @@ impl Farm {
             self.waiting.remove(id);
             actions.push(Action::Answer(id, Ok(Next::Nothing)));
         }
+        self.end_what_is_over(now, actions);
     }
 
     /// What the worker that waits longest of those that may have some gets, while there are free
-    /// tiles: free tiles of the earliest job that has any, unless one before it has a tile that is
-    /// overdue.
+    /// tiles or some to compare.
     fn next_work(&self, now: Instant) -> Option<(AskId, Ask, Work)> {
-        if !self.leases.has_free() {
+        if !self.leases.has_free() && !self.audit.has_pending() {
             return None;
         }
-        self.waiting.iter().find_map(|(id, ask)| {
-            let mut jobs = self.leases.jobs().filter(|&(job, _)| self.may_render(ask.worker, job));
-            let work = jobs.find_map(|(job, free_count)| match free_count {
-                0 => self.overdue(job, ask.worker, now).map(Work::Overdue),
-                _ => Some(Work::Free(job)),
-            });
-            Some((id, ask, work?))
-        })
+        self.waiting.iter().find_map(|(id, ask)| Some((id, ask, self.work_for(ask.worker, now)?)))
+    }
+
+    /// What a worker that waits may begin: a tile to compare or free tiles of the earliest job that
+    /// has any, unless one before it has a tile that is overdue, or a suspect, for which the worker
+    /// first finishes all else that it has.
+    fn work_for(&self, worker: WorkerId, now: Instant) -> Option<Work> {
+        if self.leases.is_on_trial(worker) {
+            return None;
+        }
+        for (job, tiles) in self.leases.jobs().filter(|&(job, _)| self.may_render(worker, job)) {
+            if let Some(tile) = self.audit.work_for(job, worker) {
+                return Some(Work::Audit(job, tile));
+            }
+            if tiles.has_suspect() && self.leases.is_without(worker) {
+                return Some(Work::Suspect(job));
+            }
+            if tiles.free_count() > 0 {
+                return Some(Work::Free(job));
+            }
+            if tiles.has_suspect() {
+                return None;
+            }
+            if let Some(lease) = self.overdue(job, worker, now) {
+                return Some(Work::Overdue(lease));
+            }
+        }
+        None
     }
 
     /// A lease of another worker whose next tile of `job` should have come long ago.
     fn overdue(&self, job: JobId, worker: WorkerId, now: Instant) -> Option<LeaseId> {
-        let JobState { thread_time, progress, .. } = self.jobs.get(&job)?;
-        let predicted = thread_time.checked_div(progress.tiles_done)?;
-        let quiet = self.leases.quietest().take_while(|&(from, ..)| from <= now);
-        let mut overdue = quiet.filter(|&(from, holder, lease)| {
-            lease.job == job && holder != worker && from + predicted * OVERDUE <= now
+        let predicted = self.leases.pace(job)?.mean()?;
+        let mut quiet = self.leases.quietest().take_while(|quiet| quiet.from <= now);
+        let overdue = quiet.find(|quiet| {
+            let from = quiet.last_tile + LONGEST_QUIET + predicted * OVERDUE;
+            quiet.lease.job == job && quiet.worker != worker && from <= now
         });
-        overdue.next().map(|(.., lease)| lease.id)
+        overdue.map(|quiet| quiet.lease.id)
     }
 
     /// Says whether a worker may have tiles of a job: one under suspicion only if all are.
@@ -387,11 +548,14 @@ impl Farm {
     fn next_second_rendering(&self) -> Option<(Instant, AskId, LeaseId)> {
         self.waiting.first()?;
         // With two that wait, the first lease will do; with one, all but its own.
-        self.leases.quietest().find_map(|(from, holder, quiet)| {
-            let mut asks = self.waiting.iter();
-            let (ask, _) = asks
-                .find(|(_, ask)| ask.worker != holder && self.may_render(ask.worker, quiet.job))?;
-            Some((from, ask, quiet.id))
+        self.leases.quietest().find_map(|quiet| {
+            let may = |worker| {
+                worker != quiet.worker
+                    && !self.leases.is_on_trial(worker)
+                    && self.may_render(worker, quiet.lease.job)
+            };
+            let (ask, _) = self.waiting.iter().find(|(_, ask)| may(ask.worker))?;
+            Some((quiet.from, ask, quiet.lease.id))
         })
     }
 
@@ -405,8 +569,7 @@ impl Farm {
         now: Instant,
     ) -> Result<Vec<LeaseName>, NoMember> {
         self.members.on_sign_of_life(worker, now)?;
-        let lost =
-            renewals.iter().filter(|&&renewal| !self.leases.on_renewal(worker, renewal, now));
+        let lost = renewals.iter().filter(|renewal| !self.leases.on_renewal(worker, renewal, now));
         Ok(lost.map(|renewal| renewal.lease).collect())
     }
 
@@ -423,33 +586,59 @@ impl Farm {
         delivery: Delivery,
         now: Instant,
     ) -> Vec<Action> {
-        let Delivery { worker, lease, tile, hash, .. } = delivery;
-        if self.leases.tiles(lease.job).is_some() && !self.leases.is_granted(worker, lease, tile) {
+        let Delivery { worker, lease, tile, .. } = delivery;
+        let is_liar = self.members.is_liar(worker);
+        if !is_liar
+            && self.leases.tiles(lease.job).is_some()
+            && !self.leases.is_granted(worker, lease, tile)
+        {
             let mut actions = vec![Action::Acknowledge(id, Verdict::Rejected)];
             actions.extend(self.on_ungranted(worker, lease, tile));
             return actions;
         }
         // The worker may have been given up meanwhile.
         let _ = self.members.on_sign_of_life(worker, now);
-        let arrival = self.leases.on_pixels(worker, lease, tile, hash, now);
-        let (Some(arrival), Some(job)) = (arrival, self.jobs.get_mut(&lease.job)) else {
-            return vec![Action::Acknowledge(id, Verdict::Rejected)];
-        };
+        let arrival = if is_liar { None } else { self.stitch(id, delivery, now) };
         let mut actions = Vec::new();
-        let (Arrival::WhileStoring(first) | Arrival::AfterDone(first)) = arrival else {
-            job.storing.insert(tile, Storing { id, first: delivery, copies: Vec::new() });
-            return vec![Action::Store(id, lease.job, tile)];
-        };
-        if first != hash {
-            job.progress.differing_tiles += 1;
-            actions.push(Action::Publish(lease.job, job.progress.clone()));
-            actions.push(Action::Log(Notice::CopiesDiffer { second: delivery, first }));
+        match arrival {
+            None => actions.push(Action::Acknowledge(id, Verdict::Rejected)),
+            Some(Arrival::First(..)) => actions.push(Action::Store(id, lease.job, tile)),
+            Some(Arrival::WhileStoring(_)) => {
+                let job = self.jobs.get_mut(&lease.job).expect("a tile of it is being stored");
+                let storing = job.storing.get_mut(&tile).expect("it is being stored");
+                storing.copies.push((id, delivery));
+            }
+            Some(Arrival::AfterDone(first)) => {
+                self.compare(delivery, first, now, &mut actions);
+                // What was in the picture may have been taken out of it.
+                match self.leases.tiles(lease.job) {
+                    Some(tiles) if tiles.is_open(tile) => {
+                        self.stitch(id, delivery, now);
+                        actions.push(Action::Store(id, lease.job, tile));
+                    }
+                    _ => actions.push(Action::Acknowledge(id, Verdict::Duplicate)),
+                }
+            }
         }
-        match job.storing.get_mut(&tile) {
-            Some(storing) => storing.copies.push(id),
-            None => actions.push(Action::Acknowledge(id, Verdict::Duplicate)),
+        // A worker that waits may have waited for the end of its leases.
+        let is_first = matches!(arrival, Some(Arrival::First(..)));
+        if !is_first || self.waiting.of(worker).is_some() {
+            self.serve(now, &mut actions);
         }
         actions
+    }
+
+    /// Has the first pixels of a tile stored. `None` when the job is over.
+    fn stitch(&mut self, id: DeliveryId, delivery: Delivery, now: Instant) -> Option<Arrival> {
+        let Delivery { worker, lease, tile, hash, seconds, .. } = delivery;
+        let job = self.jobs.get_mut(&lease.job)?;
+        // Nobody is believed more than the job's age.
+        let time = Duration::try_from_secs_f64(seconds).unwrap_or_default().min(now - job.started);
+        let arrival = self.leases.on_pixels(worker, lease, (tile, time), hash, now)?;
+        if let Arrival::First(..) = arrival {
+            job.storing.insert(tile, Storing { id, first: delivery, copies: Vec::new() });
+        }
+        Some(arrival)
     }
 
     fn on_ungranted(&mut self, worker: WorkerId, lease: LeaseName, tile: TileId) -> Option<Action> {
@@ -471,6 +660,9 @@ impl Farm {
         reason: &str,
         now: Instant,
     ) -> Vec<Action> {
+        if self.members.is_liar(worker) {
+            return Vec::new();
+        }
         if !self.leases.is_granted(worker, lease, tile) {
             return self.on_ungranted(worker, lease, tile).into_iter().collect();
         }
@@ -491,8 +683,7 @@ impl Farm {
                 actions.push(Action::Log(Notice::Suspect { worker, job, tile, reason }));
                 let losses = self.leases.on_suspicion(worker, job);
                 let reason = "its worker brought pixels that make no sense";
-                let log = |loss| Action::Log(Notice::LeaseLost(loss, reason.to_owned()));
-                actions.extend(losses.into_iter().map(log));
+                self.on_losses(losses, reason, now, &mut actions);
             }
         }
         self.serve(now, &mut actions);
@@ -506,21 +697,35 @@ impl Farm {
         let Some(storing) = job.storing.remove(&tile) else { return Vec::new() };
         let done = self.leases.on_stored(id, tile).expect("a job that stores has not ended");
         let delivery = storing.first;
-        job.contributors.insert(delivery.worker);
+        let Delivery { worker, hash, .. } = delivery;
+        let the_first = job.contributors.insert(worker);
         job.progress.tiles_done = done;
         job.progress.tally.add(&delivery.tally);
-        let thread_time = Duration::try_from_secs_f64(delivery.seconds).unwrap_or_default();
-        job.thread_time += thread_time.min(now - job.started);
-        job.progress.worker_count = job.contributors.len() as u32;
-        let (progress, elapsed) = (job.progress.clone(), now - job.started);
+        job.progress.worker_count = job.earlier.worker_count.max(job.contributors.len() as u32);
+        let (progress, elapsed) = (job.progress.clone(), job.elapsed(now));
         let mut actions = vec![Action::Acknowledge(storing.id, Verdict::Accepted)];
-        let copies = storing.copies.into_iter();
-        actions.extend(copies.map(|copy| Action::Acknowledge(copy, Verdict::Duplicate)));
-        let is_last = progress.tiles_done == progress.tile_count;
         actions.push(Action::Publish(id, progress.clone()));
         actions.push(Action::Log(Notice::TileDone { delivery, progress, elapsed }));
-        if is_last {
-            self.end(id, Outcome::Finished(elapsed), &mut actions);
+        let rendering = Rendering { worker, hash };
+        if self.members.is_liar(worker) {
+            self.take_back(worker, id, &mut actions);
+        } else if self.audit.chooses(id, tile, worker, the_first) {
+            self.audit.begin(id, tile, rendering);
+        }
+        for (copy, delivery) in storing.copies {
+            let is_open = self.leases.tiles(id).is_none_or(|tiles| tiles.is_open(tile));
+            if is_open || self.members.is_liar(delivery.worker) {
+                actions.push(Action::Acknowledge(copy, Verdict::Rejected));
+            } else {
+                actions.push(Action::Acknowledge(copy, Verdict::Duplicate));
+                self.compare(delivery, rendering, now, &mut actions);
+            }
+        }
+        self.finish(id, now);
+        if self.audit.has_pending() {
+            self.serve(now, &mut actions);
+        } else {
+            self.end_what_is_over(now, &mut actions);
         }
         actions
     }
@@ -540,28 +745,52 @@ impl Farm {
         self.last_job
     }
 
-    /// Event: a picture of these tiles, all of them free, is ordered under a number from
-    /// [`Farm::number_job`].
-    pub(crate) fn on_submit(&mut self, id: JobId, tiles: Tiles, now: Instant) -> Vec<Action> {
-        let progress = Progress { tile_count: tiles.grid().count(), ..Progress::default() };
-        let job = JobState {
-            started: now,
-            progress,
-            contributors: BTreeSet::new(),
-            thread_time: Duration::ZERO,
-            suspects: BTreeSet::new(),
-            senseless: BTreeMap::new(),
-            storing: BTreeMap::new(),
+    /// Event: a picture is ordered under a number from [`Farm::number_job`]. Some of its tiles may be
+    /// done already, the others are free.
+    pub(crate) fn on_order(
+        &mut self,
+        id: JobId,
+        tiles: Tiles,
+        earlier: Earlier,
+        now: Instant,
+    ) -> Vec<Action> {
+        let progress = Progress {
+            tiles_done: tiles.done_count(),
+            tile_count: tiles.grid().count(),
+            tally: earlier.tally,
+            worker_count: earlier.worker_count,
+            ..Progress::default()
         };
+        let is_whole = progress.tiles_done == progress.tile_count;
+        let is_begun = progress.tiles_done > 0;
+        let mut actions = Vec::from_iter(is_begun.then(|| Action::Publish(id, progress.clone())));
+        let job = JobState::new(progress, earlier, now);
+        let elapsed = job.elapsed(now);
         self.jobs.insert(id, job);
         self.leases.on_submit(id, tiles);
-        let mut actions = Vec::new();
-        if self.phase == Phase::Open {
+        if is_whole {
+            self.end(id, Outcome::Finished(elapsed), &mut actions);
+        } else if self.phase == Phase::Open {
             self.serve(now, &mut actions);
         } else {
             self.fail(id, STOPPED.to_owned(), &mut actions);
         }
         actions
+    }
+
+    /// Event: a job that has ended so is there for its clients, as an earlier start of the farm
+    /// kept it.
+    pub(crate) fn on_kept(&mut self, id: JobId, progress: Progress, now: Instant) -> Vec<Action> {
+        debug_assert!(progress.outcome.is_some(), "it has ended");
+        let mut actions = vec![Action::Publish(id, progress.clone())];
+        self.jobs.insert(id, JobState::new(progress, Earlier::default(), now));
+        self.keep_ended(id, &mut actions);
+        actions
+    }
+
+    /// What a job has got so far: how long it has been rendered, and how many workers brought tiles.
+    pub(crate) fn so_far(&self, job: JobId, now: Instant) -> Option<(Duration, u32)> {
+        self.jobs.get(&job).map(|job| (job.elapsed(now), job.progress.worker_count))
     }
 
     /// Event: nobody wants a job's picture any more.
@@ -573,6 +802,65 @@ impl Farm {
         self.ended.retain(|&ended| ended != job);
         self.forget(job, &mut actions);
         actions
+    }
+
+    /// Notes a job of which there is nothing more to be rendered, if it is one.
+    fn finish(&mut self, job: JobId, now: Instant) {
+        if self.leases.tiles(job).is_some_and(Tiles::is_over) {
+            self.finishing.entry(job).or_insert(now);
+        }
+    }
+
+    /// Ends jobs of which each tile is in the picture or was set aside, and none is to be compared
+    /// any more.
+    fn end_what_is_over(&mut self, now: Instant, actions: &mut Vec<Action>) {
+        for (id, since) in std::mem::take(&mut self.finishing) {
+            // A tile that was set aside may be on its way all the same.
+            if !self.leases.tiles(id).is_some_and(Tiles::is_over) {
+                continue;
+            }
+            for tile in self.hopeless(id, since, now) {
+                if !std::mem::replace(&mut self.is_told_of_no_audit, true) {
+                    actions.push(Action::Log(Notice::NoAudit));
+                }
+                self.give_up(id, tile);
+            }
+            if self.audit.of(id).next().is_some() {
+                self.finishing.insert(id, since);
+                continue;
+            }
+            let time = self.jobs.get(&id).map_or(Duration::ZERO, |job| job.elapsed(now));
+            if let Some(reason) = self.failure(id) {
+                self.fail(id, reason, actions);
+            } else {
+                self.end(id, Outcome::Finished(time), actions);
+            }
+        }
+        self.look_at = (!self.finishing.is_empty()).then(|| now + self.term);
+    }
+
+    /// Why a finished job is not what it should be.
+    fn failure(&self, id: JobId) -> Option<String> {
+        let (tiles, unsettled) = (self.leases.tiles(id)?, &self.jobs.get(&id)?.unsettled);
+        let list = |tiles: &mut dyn Iterator<Item = &TileId>| {
+            tiles.map(|tile| tile.number().to_string()).collect::<Vec<String>>().join(", ")
+        };
+        let aside = tiles.aside();
+        let mut reasons = Vec::new();
+        if !aside.is_empty() {
+            let tiles = list(&mut aside.iter());
+            reasons.push(format!(
+                "set aside, since {MOST_LOSSES} workers were lost with each or stood still: {tiles}"
+            ));
+        }
+        if !unsettled.is_empty() {
+            let tiles = list(&mut unsettled.iter());
+            reasons.push(format!("rendered differently, and nobody knows who is right: {tiles}"));
+        }
+        let right = tiles.done_count() - unsettled.len() as u32;
+        let count = tiles.grid().count();
+        (!reasons.is_empty())
+            .then(|| format!("{right} of {count} tiles are right; {}", reasons.join("; ")))
     }
 
     fn fail(&mut self, job: JobId, reason: String, actions: &mut Vec<Action>) {
@@ -591,17 +879,25 @@ impl Farm {
         job.progress.outcome = Some(outcome);
         actions.push(Action::Publish(id, job.progress.clone()));
         for storing in std::mem::take(&mut job.storing).into_values() {
-            let deliveries = std::iter::once(storing.id).chain(storing.copies);
+            let copies = storing.copies.into_iter().map(|(id, _)| id);
+            let deliveries = std::iter::once(storing.id).chain(copies);
             actions.extend(deliveries.map(|id| Action::Acknowledge(id, Verdict::Rejected)));
         }
         self.leases.on_end(id);
+        self.audit.on_end(id);
+        self.finishing.remove(&id);
+        self.keep_ended(id, actions);
+        true
+    }
+
+    /// Keeps a job that has ended for its clients; another one may have to go.
+    fn keep_ended(&mut self, id: JobId, actions: &mut Vec<Action>) {
         self.ended.push_back(id);
         if self.ended.len() > KEPT_AFTER_END
             && let Some(oldest) = self.ended.pop_front()
         {
             self.forget(oldest, actions);
         }
-        true
     }
 
     fn forget(&mut self, job: JobId, actions: &mut Vec<Action>) {
@@ -625,12 +921,15 @@ impl Farm {
         actions
     }
 
-    /// Event: the coordinator is to stop. Workers are sent home, and every job has ended.
+    /// Event: the coordinator is to stop. Workers are sent home, and every job that will not be there
+    /// again has ended.
     pub(crate) fn on_shut_down(&mut self, now: Instant) -> Vec<Action> {
         let mut actions = self.on_close();
-        let jobs: Vec<JobId> = self.jobs.keys().copied().collect();
-        for job in jobs {
-            self.fail(job, STOPPED.to_owned(), &mut actions);
+        if !self.keeps_jobs {
+            let jobs: Vec<JobId> = self.jobs.keys().copied().collect();
+            for job in jobs {
+                self.fail(job, STOPPED.to_owned(), &mut actions);
+            }
         }
         self.phase = Phase::Farewell(now + FAREWELL);
         self.end_farewell(now, &mut actions);
@@ -640,7 +939,7 @@ impl Farm {
     /// Sends a worker home. Its leases end with it; since that is no misfortune, nobody is told.
     fn send_home(&mut self, worker: WorkerId, ask: AskId, actions: &mut Vec<Action>) {
         self.members.remove(worker);
-        self.leases.on_worker_lost(worker);
+        self.leases.on_worker_lost(worker, false);
         actions.push(Action::Answer(ask, Ok(Next::GoHome)));
     }
 
@@ -656,6 +955,11 @@ impl Farm {
 
 #[cfg(test)]
 impl Farm {
+    /// Event: a picture of these tiles, all of them free, is ordered.
+    pub(crate) fn on_submit(&mut self, id: JobId, tiles: Tiles, now: Instant) -> Vec<Action> {
+        self.on_order(id, tiles, Earlier::default(), now)
+    }
+
     /// Which start of the farm this is.
     pub(crate) fn incarnation(&self) -> Incarnation {
         self.identity.incarnation
@@ -667,6 +971,7 @@ impl Farm {
         self.members.check();
         self.leases.check(is_member);
         self.waiting.check(is_member);
+        self.audit.check(|job| self.leases.tiles(job).is_some());
         for (id, job) in &self.jobs {
             let tiles = self.leases.tiles(*id);
             assert_eq!(tiles.is_some(), job.progress.outcome.is_none());
@@ -678,6 +983,8 @@ impl Farm {
         assert!(self.ended.len() <= KEPT_AFTER_END);
     }
 }
+
+mod trust;
 
 #[cfg(test)]
 mod tests;

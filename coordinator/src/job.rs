@@ -1,12 +1,18 @@
 //! What the shell keeps of a job: its scene, its picture, and how far it is for those who watch.
 
+use std::sync::Arc;
+
 use rtfarm_core::{render::Settings, tile::TileGrid};
 use rtfarm_job::Progress;
-use rtfarm_picture::Picture;
+use rtfarm_picture::{Canvas, Picture};
 use rtfarm_proto::{JobId, TileHasher};
 use tokio::sync::watch;
 
-use crate::store::SceneFile;
+use crate::{
+    record::{Plan, to_event},
+    state::JobFolder,
+    store::SceneFile,
+};
 
 /// A picture being rendered or ready.
 #[derive(Debug)]
@@ -17,11 +23,28 @@ pub struct Job {
     pub(crate) grid: TileGrid,
     /// Hashes its tiles' pixels as workers do.
     pub(crate) hasher: TileHasher,
-    pub(crate) picture: Picture,
+    pub(crate) canvas: Canvas,
+    /// Where it outlives this process.
+    pub(crate) folder: Option<JobFolder>,
     pub(crate) progress: watch::Sender<Progress>,
 }
 
 impl Job {
+    /// Makes one of which nothing is known to be done.
+    pub(crate) fn new(
+        id: JobId,
+        plan: &Plan,
+        scene: SceneFile,
+        canvas: Canvas,
+        folder: Option<JobFolder>,
+    ) -> Arc<Self> {
+        let &Plan { settings, grid, .. } = plan;
+        let hasher = TileHasher::new(id, scene.hash(), settings, grid);
+        let progress = Progress { tile_count: grid.count(), ..Progress::default() };
+        let progress = watch::Sender::new(progress);
+        Arc::new(Self { id, scene, settings, grid, hasher, canvas, folder, progress })
+    }
+
     /// Its number.
     pub fn id(&self) -> JobId {
         self.id
@@ -29,7 +52,7 @@ impl Job {
 
     /// Its picture, complete once the job has finished.
     pub fn picture(&self) -> &Picture {
-        &self.picture
+        self.canvas.picture()
     }
 
     /// How far it is, now and later.
@@ -40,15 +63,43 @@ impl Job {
     /// Shows how far it is. Threads may bring the states out of order: one that is older than
     /// what is shown already is not shown.
     pub(crate) fn publish(&self, progress: Progress) {
+        if progress.outcome.is_some() {
+            self.keep_end(&progress);
+        }
         self.progress.send_if_modified(|shown| replace_older(shown, progress));
+    }
+}
+
+impl Job {
+    /// Has the end of a job outlive this process before anybody is told of it.
+    fn keep_end(&self, progress: &Progress) {
+        let Some(folder) = &self.folder else { return };
+        let end = to_event(progress);
+        let kept = self.canvas.sync().and_then(|()| {
+            folder.change(|record| {
+                record.end.get_or_insert(end);
+            })
+        });
+        if let Err(error) = kept {
+            // A later coordinator finds what there is of it and goes on.
+            tracing::error!(job = self.id.0, reason = %error, "cannot keep the end of a job");
+        }
+    }
+
+    /// Removes what outlives this process.
+    pub(crate) fn forget(&self) {
+        if let Some(Err(error)) = self.folder.as_ref().map(JobFolder::forget) {
+            tracing::error!(job = self.id.0, reason = %error, "cannot remove the files of a job");
+        }
     }
 }
 
 /// Replaces an older state of a job; says whether it was older.
 fn replace_older(shown: &mut Progress, progress: Progress) -> bool {
-    // Each of these only grows, and one of them does with every change.
+    // One of these grows with every change, and none before it shrinks.
     let age = |progress: &Progress| {
-        (progress.outcome.is_some(), progress.tiles_done, progress.differing_tiles)
+        let Progress { tiles_done, differing_tiles, taken_back, outcome, .. } = progress;
+        (outcome.is_some(), *taken_back, *tiles_done, *differing_tiles)
     };
     let is_older = age(shown) < age(&progress);
     if is_older {
@@ -72,5 +123,8 @@ mod tests {
         assert!(replace_older(&mut shown, state(3, Some(Outcome::Failed(String::new())))));
         assert!(!replace_older(&mut shown, state(4, None)), "the end is the last to be shown");
         assert_eq!(shown.tiles_done, 3);
+        let mut shown = state(3, None);
+        assert!(replace_older(&mut shown, Progress { taken_back: 2, ..state(1, None) }));
+        assert!(!replace_older(&mut shown, state(3, None)), "tiles were taken back since");
     }
 }

@@ -1,6 +1,6 @@
 //! Who renders which tiles of which job, and until when. Decisions alone: time is an argument,
 //! nothing waits. A lease ends when its last tile has come, when it runs out, when its worker is
-//! lost and when its job ends.
+//! lost and when its job ends. A tile that stands still leaves its lease by itself.
 
 use std::{
     collections::{BTreeMap, BTreeSet},
@@ -10,37 +10,62 @@ use std::{
 use rtfarm_core::tile::TileId;
 use rtfarm_proto::{JobId, LeaseId, LeaseName, Renewal, WorkerId};
 
-use crate::tiles::{Arrival, PixelHash, Place, Tiles};
+use crate::{
+    pace::Pace,
+    tiles::{Arrival, PixelHash, Place, Rendering, Tiles},
+};
 
-/// The longest run of tiles in one lease: a lost worker costs no more than its rendering.
-const LONGEST_RUN: usize = 64;
+/// The longest run of tiles in one lease. Workers ask for as many as they render in a moment: a lost one
+/// costs no more than that.
+const LONGEST_RUN: usize = 1024;
+
+/// The longest run for each thread of a worker of which no tile of the job has come yet: nobody
+/// knows how slow it is.
+const FIRST_RUN: usize = 4;
 
 /// How many times each thread of the farm will ask again, if runs go on at the present length:
 /// runs shorten as the work does, so that all threads finish together.
 const RUNS_PER_THREAD: usize = 2;
 
-/// A lease from which no tile came for this long has its tiles rendered a second time, once
-/// nothing else is left to do.
-const QUIET: Duration = Duration::from_millis(400);
+/// A lease from which no tile came for so many times what tiles of its job take has its tiles
+/// rendered a second time, once nothing else is left to do.
+const QUIET_TILES: u32 = 3;
 
-/// The leases of all jobs that are being rendered, and those jobs' tiles. Invariants: a lease
-/// holds at least one tile, and all its tiles are open; each lease has one entry in `expiries`,
-/// `by_worker` and `by_job`, and one in `last_tiles` exactly while it holds a tile alone;
-/// `with_free` has exactly the jobs with a free tile.
+/// But not earlier than this, since answers take their time on the way.
+const SHORTEST_QUIET: Duration = Duration::from_millis(20);
+
+/// And not later than this.
+pub(crate) const LONGEST_QUIET: Duration = Duration::from_millis(400);
+
+/// The leases of all jobs that are being rendered, and those jobs. Invariants: a lease holds at
+/// least one tile, and those that it holds alone or shares are open; each lease has one entry in `expiries`, `by_worker`
+/// and `by_job`, and one in `quiet` exactly while it holds a tile alone that is under no
+/// suspicion; `with_free` has exactly the jobs with a free tile, `with_suspects` those with a free
+/// tile under suspicion.
 #[derive(Debug)]
 pub(crate) struct Leases {
     term: Duration,
     last_id: LeaseId,
-    jobs: BTreeMap<JobId, Tiles>,
+    jobs: BTreeMap<JobId, Job>,
     with_free: BTreeSet<JobId>,
+    with_suspects: BTreeSet<JobId>,
     held: BTreeMap<LeaseId, Lease>,
     expiries: BTreeSet<(Instant, LeaseId)>,
-    last_tiles: BTreeSet<(Instant, LeaseId)>,
+    quiet: BTreeSet<(Instant, LeaseId)>,
     by_worker: BTreeSet<(WorkerId, LeaseId)>,
     by_job: BTreeSet<(JobId, LeaseId)>,
-    /// Every lease that was ever given of these jobs, and what it covered.
-    granted: BTreeMap<JobId, BTreeMap<LeaseId, Grant>>,
 }
+
+#[derive(Debug)]
+struct Job {
+    tiles: Tiles,
+    pace: Pace,
+    /// Every lease that was ever given, and what it covered.
+    granted: BTreeMap<LeaseId, Grant>,
+}
+
+/// No tiles.
+const NONE: BTreeSet<Place> = BTreeSet::new();
 
 /// Who may bring which tiles under a lease, even after its end.
 #[derive(Debug)]
@@ -54,15 +79,35 @@ struct Grant {
 struct Lease {
     job: JobId,
     worker: WorkerId,
+    threads: usize,
+    /// Its one tile is under suspicion, and its worker has no other lease.
+    is_lone: bool,
     /// Tiles that are in no other lease.
     alone: BTreeSet<Place>,
     /// Tiles that another lease holds too.
     shared: BTreeSet<Place>,
+    /// Tiles that it renders again, to be compared with what came of them before.
+    again: BTreeSet<Place>,
+    /// Tiles of those on which threads of its worker are known to be.
+    begun: BTreeMap<Place, Begun>,
+    /// When it runs out, unless there is progress.
     until: Instant,
-    /// The work that its worker has told of.
+    /// The steps that brought its scene, as its worker has told.
     work: u64,
     /// When the lease began, or the last tile under it came.
     last_tile: Instant,
+    /// Its entries in `expiries` and `quiet`.
+    expires: Instant,
+    quiet_from: Option<Instant>,
+}
+
+/// How far a tile is.
+#[derive(Debug, Clone, Copy)]
+struct Begun {
+    /// The steps that its worker has told of.
+    work: u64,
+    /// When it stands still, unless there is progress.
+    until: Instant,
 }
 
 /// A run of tiles for a worker, in the order of rendering.
@@ -72,13 +117,28 @@ pub(crate) struct Run {
     pub(crate) tiles: Vec<TileId>,
 }
 
-/// A lease that its worker no longer has.
+/// Tiles of a lease that its worker no longer has.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct Loss {
     pub(crate) lease: LeaseName,
     pub(crate) worker: WorkerId,
     /// The tiles that had not come, in the order of rendering.
     pub(crate) tiles: Vec<TileId>,
+    /// Those of them that were in work when too many workers were lost, and are set aside.
+    pub(crate) aside: Vec<TileId>,
+    /// Those of them that were to be compared with what came of them before.
+    pub(crate) again: Vec<TileId>,
+}
+
+/// A lease of which a tile may be rendered a second time.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Quiet {
+    pub(crate) lease: LeaseName,
+    pub(crate) worker: WorkerId,
+    /// From when on.
+    pub(crate) from: Instant,
+    /// When it began, or its last tile came.
+    pub(crate) last_tile: Instant,
 }
 
 impl Leases {
@@ -89,48 +149,68 @@ impl Leases {
             last_id: LeaseId(0),
             jobs: BTreeMap::new(),
             with_free: BTreeSet::new(),
+            with_suspects: BTreeSet::new(),
             held: BTreeMap::new(),
             expiries: BTreeSet::new(),
-            last_tiles: BTreeSet::new(),
+            quiet: BTreeSet::new(),
             by_worker: BTreeSet::new(),
             by_job: BTreeSet::new(),
-            granted: BTreeMap::new(),
         }
     }
 
     /// The tiles of a job, as long as it is rendered.
     pub(crate) fn tiles(&self, job: JobId) -> Option<&Tiles> {
-        self.jobs.get(&job)
+        self.jobs.get(&job).map(|job| &job.tiles)
     }
 
-    /// When the next lease runs out.
+    /// What the tiles of a job cost, as long as it is rendered.
+    pub(crate) fn pace(&self, job: JobId) -> Option<&Pace> {
+        self.jobs.get(&job).map(|job| &job.pace)
+    }
+
+    /// When the next lease runs out, or a tile of one.
     pub(crate) fn next_expiry(&self) -> Option<Instant> {
         self.expiries.first().map(|&(until, _)| until)
     }
 
-    /// Leases of which a tile may be rendered a second time, the quietest first: from when on,
-    /// whose it is and of which job.
-    pub(crate) fn quietest(&self) -> impl Iterator<Item = (Instant, WorkerId, LeaseName)> {
-        self.last_tiles.iter().map(|&(last_tile, id)| {
-            let Lease { worker, job, .. } = self.held[&id];
-            (last_tile + QUIET, worker, LeaseName { job, id })
+    /// Leases of which a tile may be rendered a second time, the quietest first.
+    pub(crate) fn quietest(&self) -> impl Iterator<Item = Quiet> {
+        self.quiet.iter().map(|&(from, id)| {
+            let Lease { worker, job, last_tile, .. } = self.held[&id];
+            Quiet { lease: LeaseName { job, id }, worker, from, last_tile }
         })
     }
 
-    /// The jobs that are being rendered, the earliest first, and how many free tiles each has.
-    pub(crate) fn jobs(&self) -> impl Iterator<Item = (JobId, usize)> {
-        self.jobs.iter().map(|(&job, tiles)| (job, tiles.free_count()))
+    /// The jobs that are being rendered, the earliest first, and their tiles.
+    pub(crate) fn jobs(&self) -> impl Iterator<Item = (JobId, &Tiles)> {
+        self.jobs.iter().map(|(&id, job)| (id, &job.tiles))
     }
 
-    /// Says whether any job has a free tile.
+    /// Says whether any job has a free tile, be it under suspicion.
     pub(crate) fn has_free(&self) -> bool {
-        !self.with_free.is_empty()
+        !self.with_free.is_empty() || !self.with_suspects.is_empty()
     }
 
-    /// Event: a job is to be rendered, of which all tiles are free.
-    pub(crate) fn on_submit(&mut self, job: JobId, tiles: Tiles) {
-        self.jobs.insert(job, tiles);
-        self.with_free.insert(job);
+    /// The leases of a worker, the earliest first.
+    fn of(&self, worker: WorkerId) -> impl Iterator<Item = LeaseId> {
+        let of_worker = (worker, LeaseId(0))..=(worker, LeaseId(u64::MAX));
+        self.by_worker.range(of_worker).map(|&(_, id)| id)
+    }
+
+    /// Says whether a worker has no lease.
+    pub(crate) fn is_without(&self, worker: WorkerId) -> bool {
+        self.of(worker).next().is_none()
+    }
+
+    /// Says whether a worker has a tile under suspicion, besides which it gets no other.
+    pub(crate) fn is_on_trial(&self, worker: WorkerId) -> bool {
+        self.of(worker).any(|id| self.held[&id].is_lone)
+    }
+
+    /// Event: a job is to be rendered, of which no tile is in a lease.
+    pub(crate) fn on_submit(&mut self, id: JobId, tiles: Tiles) {
+        self.jobs.insert(id, Job { tiles, pace: Pace::default(), granted: BTreeMap::new() });
+        self.index_job(id);
     }
 
     /// Event: nobody is to render a job any longer.
@@ -141,12 +221,11 @@ impl Leases {
             self.remove(id);
         }
         self.jobs.remove(&job);
-        self.with_free.remove(&job);
-        self.granted.remove(&job);
+        self.index_job(job);
     }
 
     /// Event: `worker`, with `threads` of the farm's `all_threads`, would render up to `most` free
-    /// tiles of `job`. `None` when that has none.
+    /// tiles of `job` that are under no suspicion. `None` when that has none.
     pub(crate) fn on_idle(
         &mut self,
         worker: WorkerId,
@@ -155,15 +234,49 @@ impl Leases {
         most: usize,
         now: Instant,
     ) -> Option<Run> {
-        let tiles = self.jobs.get_mut(&job).filter(|tiles| tiles.free_count() > 0)?;
-        let shared_out = tiles.free_count() * threads / (RUNS_PER_THREAD * all_threads.max(1));
-        let count = shared_out.clamp(1, LONGEST_RUN).min(most.max(1));
+        let Job { tiles, pace, .. } =
+            self.jobs.get_mut(&job).filter(|job| job.tiles.free_count() > 0)?;
+        let share = tiles.free_count() * threads / (RUNS_PER_THREAD * all_threads.max(1));
+        let count = match pace.speed(worker) {
+            Some(speed) => (share as f64 * speed.min(1.0)) as usize,
+            None => share.min(FIRST_RUN * threads),
+        };
         self.last_id.0 += 1;
-        let places = tiles.take_free(count, self.last_id);
-        if tiles.free_count() == 0 {
-            self.with_free.remove(&job);
+        let places = tiles.take_free(count.clamp(1, LONGEST_RUN).min(most.max(1)), self.last_id);
+        self.index_job(job);
+        Some(self.grant((worker, threads), job, [places, NONE, NONE], now))
+    }
+
+    /// Event: `worker`, which has no lease, would render a free tile of `job` that is under
+    /// suspicion.
+    pub(crate) fn on_trial(&mut self, worker: WorkerId, job: JobId, now: Instant) -> Option<Run> {
+        self.last_id.0 += 1;
+        let place = self.jobs.get_mut(&job)?.tiles.take_suspect(self.last_id)?;
+        self.index_job(job);
+        let run = self.grant((worker, 1), job, [BTreeSet::from([place]), NONE, NONE], now);
+        let lease = self.held.get_mut(&run.lease.id)?;
+        lease.is_lone = true;
+        self.index(run.lease.id);
+        Some(run)
+    }
+
+    /// Event: `worker` has pixels of these tiles of `job`. It gets those that are free; `None` when none
+    /// is.
+    pub(crate) fn on_offer(
+        &mut self,
+        (worker, threads): (WorkerId, usize),
+        job: JobId,
+        offered: &[TileId],
+        now: Instant,
+    ) -> Option<Run> {
+        let id = LeaseId(self.last_id.0 + 1);
+        let places = self.jobs.get_mut(&job)?.tiles.take(offered, id);
+        self.index_job(job);
+        if places.is_empty() {
+            return None;
         }
-        Some(self.grant(worker, job, (places, BTreeSet::new()), now))
+        self.last_id = id;
+        Some(self.grant((worker, threads), job, [places, NONE, NONE], now))
     }
 
     /// Event: `worker` would render a tile of the lease `quiet` a second time. It gets the last
@@ -178,52 +291,130 @@ impl Leases {
         let place = lease.alone.pop_last()?;
         lease.shared.insert(place);
         let job = lease.job;
-        if lease.alone.is_empty() {
-            self.last_tiles.remove(&(lease.last_tile, quiet));
-        }
+        self.index(quiet);
         self.last_id.0 += 1;
-        self.jobs.get_mut(&job)?.share(place, self.last_id);
-        Some(self.grant(worker, job, (BTreeSet::new(), BTreeSet::from([place])), now))
+        self.jobs.get_mut(&job)?.tiles.share(place, self.last_id);
+        Some(self.grant((worker, 1), job, [NONE, BTreeSet::from([place]), NONE], now))
+    }
+
+    /// Event: `worker` would render a tile of `job` again, to be compared with what is in the
+    /// picture.
+    pub(crate) fn on_audit(
+        &mut self,
+        worker: WorkerId,
+        job: JobId,
+        tile: TileId,
+        now: Instant,
+    ) -> Option<Run> {
+        let place = self.tiles(job)?.place(tile);
+        self.last_id.0 += 1;
+        Some(self.grant((worker, 1), job, [NONE, NONE, BTreeSet::from([place])], now))
     }
 
     /// Enters a lease with the last number given; its tiles know of it already.
     fn grant(
         &mut self,
-        worker: WorkerId,
+        (worker, threads): (WorkerId, usize),
         job: JobId,
-        (alone, shared): (BTreeSet<Place>, BTreeSet<Place>),
+        [alone, shared, again]: [BTreeSet<Place>; 3],
         now: Instant,
     ) -> Run {
         let id = self.last_id;
-        let tiles = &self.jobs[&job];
-        let run = Run {
-            lease: LeaseName { job, id },
-            tiles: tiles.at(if alone.is_empty() { &shared } else { &alone }),
-        };
-        let mut granted: Box<[TileId]> = run.tiles.as_slice().into();
-        granted.sort_unstable();
-        self.granted.entry(job).or_default().insert(id, Grant { worker, tiles: granted });
-        let until = now + self.term;
-        self.expiries.insert((until, id));
+        let Job { tiles, granted, .. } = self.jobs.get_mut(&job).expect("it has these tiles");
+        let places = alone.iter().chain(&shared).chain(&again).copied().collect();
+        let run = Run { lease: LeaseName { job, id }, tiles: tiles.at(&places) };
+        let mut covered: Box<[TileId]> = run.tiles.as_slice().into();
+        covered.sort_unstable();
+        granted.insert(id, Grant { worker, tiles: covered });
         self.by_worker.insert((worker, id));
         self.by_job.insert((job, id));
-        if !alone.is_empty() {
-            self.last_tiles.insert((now, id));
-        }
-        self.held.insert(id, Lease { job, worker, alone, shared, until, work: 0, last_tile: now });
+        let until = now + self.term;
+        let lease = Lease {
+            job,
+            worker,
+            threads,
+            is_lone: false,
+            alone,
+            shared,
+            again,
+            begun: BTreeMap::new(),
+            until,
+            work: 0,
+            last_tile: now,
+            expires: until,
+            quiet_from: None,
+        };
+        self.expiries.insert((until, id));
+        self.held.insert(id, lease);
+        self.index(id);
         run
     }
 
+    /// Brings the entries of a lease in `expiries` and `quiet` up to date.
+    fn index(&mut self, id: LeaseId) {
+        let Some(lease) = self.held.get_mut(&id) else { return };
+        let tiles = lease.begun.values().map(|begun| begun.until);
+        let expires = tiles.chain([lease.until]).min().expect("there is one at least");
+        // Tiles of one message come at one time.
+        if lease.expires != expires {
+            self.expiries.remove(&(lease.expires, id));
+            lease.expires = expires;
+            self.expiries.insert((expires, id));
+        }
+
+        let quiet_from = (!lease.alone.is_empty() && !lease.is_lone).then(|| {
+            let mean = self.jobs[&lease.job].pace.mean();
+            let silence = mean.map_or(LONGEST_QUIET, |mean| mean * QUIET_TILES);
+            lease.last_tile + silence.clamp(SHORTEST_QUIET, LONGEST_QUIET)
+        });
+        if lease.quiet_from != quiet_from {
+            if let Some(from) = lease.quiet_from {
+                self.quiet.remove(&(from, id));
+            }
+            self.quiet.extend(quiet_from.map(|from| (from, id)));
+            lease.quiet_from = quiet_from;
+        }
+    }
+
+    /// Brings the entries of a job in `with_free` and `with_suspects` up to date.
+    fn index_job(&mut self, id: JobId) {
+        let tiles = self.jobs.get(&id).map(|job| &job.tiles);
+        let has = [
+            (tiles.is_some_and(|tiles| tiles.free_count() > 0), &mut self.with_free),
+            (tiles.is_some_and(Tiles::has_suspect), &mut self.with_suspects),
+        ];
+        for (has_some, jobs) in has {
+            if has_some {
+                jobs.insert(id)
+            } else {
+                jobs.remove(&id)
+            };
+        }
+    }
+
     /// Event: `worker` says how far it is under a lease, which lives on if that is further than it
-    /// ever was. Says whether it still has that lease.
-    pub(crate) fn on_renewal(&mut self, worker: WorkerId, renewal: Renewal, now: Instant) -> bool {
-        let Renewal { lease: LeaseName { job, id }, work } = renewal;
+    /// ever was, and so does each of its tiles. Says whether it still has that lease.
+    pub(crate) fn on_renewal(&mut self, worker: WorkerId, renewal: &Renewal, now: Instant) -> bool {
+        let LeaseName { job, id } = renewal.lease;
         let held = self.held.get_mut(&id);
         let Some(lease) = held.filter(|lease| lease.worker == worker && lease.job == job) else {
             return false;
         };
-        if work > lease.work {
-            lease.work = work;
+        let until = now + self.term;
+        let mut goes_on = renewal.work > lease.work;
+        lease.work = lease.work.max(renewal.work);
+        let tiles = &self.jobs[&job].tiles;
+        for &(number, work) in &renewal.tiles {
+            let Some(place) = tiles.grid().tile(number).map(|tile| tiles.place(tile)) else {
+                continue;
+            };
+            let is_further = lease.begun.get(&place).is_none_or(|begun| work > begun.work);
+            if is_further && lease.holds(place) {
+                lease.begun.insert(place, Begun { work, until });
+                goes_on = true;
+            }
+        }
+        if goes_on {
             self.renew(id, now);
         }
         true
@@ -232,143 +423,245 @@ impl Leases {
     /// Has a lease run out a term from now.
     fn renew(&mut self, id: LeaseId, now: Instant) {
         if let Some(lease) = self.held.get_mut(&id) {
-            self.expiries.remove(&(lease.until, id));
             lease.until = now + self.term;
-            self.expiries.insert((lease.until, id));
+            self.index(id);
         }
     }
 
     /// Says whether `worker` was ever to render `tile` under a lease of a job that has not ended.
     pub(crate) fn is_granted(&self, worker: WorkerId, name: LeaseName, tile: TileId) -> bool {
-        let grant = self.granted.get(&name.job).and_then(|granted| granted.get(&name.id));
+        let grant = self.jobs.get(&name.job).and_then(|job| job.granted.get(&name.id));
         grant
             .is_some_and(|grant| grant.worker == worker && grant.tiles.binary_search(&tile).is_ok())
     }
 
-    /// Event: pixels of `tile` came from `worker`. Tiles are deterministic: the first copy wins,
-    /// however late. `None` when the job is over or the worker was not granted the tile.
+    /// Event: pixels of `tile` came from `worker`, which took `time` on a thread. Tiles are
+    /// deterministic: the first copy wins, however late. `None` when the job is over or the worker
+    /// was not granted the tile.
     pub(crate) fn on_pixels(
         &mut self,
         worker: WorkerId,
         name: LeaseName,
-        tile: TileId,
+        (tile, time): (TileId, Duration),
         hash: PixelHash,
         now: Instant,
     ) -> Option<Arrival> {
         if !self.is_granted(worker, name, tile) {
             return None;
         }
-        let tiles = self.jobs.get_mut(&name.job)?;
-        let arrival = tiles.on_pixels(tile, hash);
-        if let Arrival::First(place, holders) = arrival {
-            if tiles.free_count() == 0 {
-                self.with_free.remove(&name.job);
-            }
+        let Job { tiles, pace, .. } = self.jobs.get_mut(&name.job)?;
+        let arrival = tiles.on_pixels(tile, Rendering { worker, hash });
+        let place = tiles.place(tile);
+        let is_again = self.held.get(&name.id).is_some_and(|lease| lease.again.contains(&place));
+        if let Arrival::First(_, holders) = arrival {
+            pace.on_tile(worker, time);
+            self.index_job(name.job);
             self.on_tile(name.id, now);
             for holder in holders.iter() {
                 self.drop_tile(holder, place, now);
             }
         }
+        if is_again {
+            self.on_tile(name.id, now);
+            self.drop_tile(name.id, place, now);
+        }
         Some(arrival)
+    }
+
+    /// Event: another worker made the same of a tile in the picture.
+    pub(crate) fn confirm(&mut self, job: JobId, tile: TileId) {
+        if let Some(job) = self.jobs.get_mut(&job) {
+            job.tiles.confirm(tile);
+        }
+    }
+
+    /// Frees the tiles in the picture of a job that `worker` rendered and no other confirmed.
+    pub(crate) fn take_back(&mut self, job: JobId, worker: WorkerId) -> Vec<TileId> {
+        let taken = self.jobs.get_mut(&job).map(|job| job.tiles.take_back(worker));
+        self.index_job(job);
+        taken.unwrap_or_default()
     }
 
     /// Event: the pixels of `tile` are in the picture. Answers with the number of such tiles;
     /// `None` when the job is over.
     pub(crate) fn on_stored(&mut self, job: JobId, tile: TileId) -> Option<u32> {
-        let tiles = self.jobs.get_mut(&job)?;
+        let tiles = &mut self.jobs.get_mut(&job)?.tiles;
         tiles.on_stored(tile);
         Some(tiles.done_count())
     }
 
     /// Event: a tile came under a lease, which is not quiet therefore and lives on.
     fn on_tile(&mut self, id: LeaseId, now: Instant) {
-        self.renew(id, now);
         if let Some(lease) = self.held.get_mut(&id) {
-            if self.last_tiles.remove(&(lease.last_tile, id)) {
-                self.last_tiles.insert((now, id));
-            }
             lease.last_tile = now;
+            self.renew(id, now);
         }
     }
 
     /// Takes a tile whose pixels came out of a lease, which ends with its last tile.
     fn drop_tile(&mut self, id: LeaseId, place: Place, now: Instant) {
         let Some(lease) = self.held.get_mut(&id) else { return };
-        lease.shared.remove(&place);
-        if lease.alone.remove(&place) && lease.alone.is_empty() {
-            self.last_tiles.remove(&(lease.last_tile, id));
-        }
-        if lease.alone.is_empty() && lease.shared.is_empty() {
-            let of_worker = (lease.worker, id)..=(lease.worker, LeaseId(u64::MAX));
+        lease.drop_place(place);
+        if lease.count() == 0 {
+            let worker = lease.worker;
             self.remove(id);
             // The turn of the next comes now.
-            let later: Vec<LeaseId> = self.by_worker.range(of_worker).map(|&(_, id)| id).collect();
+            let later: Vec<LeaseId> = self.of(worker).filter(|&other| other > id).collect();
             for next in later {
                 self.renew(next, now);
             }
+        } else {
+            self.index(id);
         }
     }
 
-    /// Event: time passes. Leases that ran out are lost and their tiles free again.
+    /// Event: time passes. Leases that ran out are lost and their tiles free again, and so are
+    /// tiles that stand still.
     pub(crate) fn on_time(&mut self, now: Instant) -> Vec<Loss> {
         let mut losses = Vec::new();
-        while let Some(&(until, id)) = self.expiries.first()
-            && until <= now
+        while let Some(&(expires, id)) = self.expiries.first()
+            && expires <= now
         {
+            let lease = &self.held[&id];
             // Its worker comes to it after what it was leased before.
-            let worker = self.held[&id].worker;
-            let earlier = self.by_worker.range((worker, LeaseId(0))..(worker, id)).next();
-            if earlier.is_some() {
+            let is_waiting = self.of(lease.worker).next() != Some(id);
+            let lives = is_waiting || lease.until > now;
+            let stands = lease.begun.iter().filter(|(_, begun)| begun.until <= now);
+            let standing: BTreeSet<Place> = stands.map(|(&place, _)| place).collect();
+            if standing.len() == lease.count() || !lives {
+                losses.extend(self.on_standstill(id));
+            } else if standing.is_empty() {
                 self.renew(id, now);
             } else {
-                losses.extend(self.lose(id));
+                losses.extend(self.lose_tiles(id, standing));
             }
         }
         losses
     }
 
-    /// Event: `worker` is gone and will not come back.
-    pub(crate) fn on_worker_lost(&mut self, worker: WorkerId) -> Vec<Loss> {
-        let of_worker = (worker, LeaseId(0))..=(worker, LeaseId(u64::MAX));
-        let lost: Vec<LeaseId> = self.by_worker.range(of_worker).map(|&(_, id)| id).collect();
-        lost.into_iter().filter_map(|id| self.lose(id)).collect()
+    /// A lease ran out. What its worker has not come to yet is lost with it.
+    fn on_standstill(&mut self, id: LeaseId) -> Vec<Loss> {
+        let worker = self.held[&id].worker;
+        let is_idle = |id: &LeaseId| self.held[id].work == 0 && self.held[id].begun.is_empty();
+        let idle: Vec<LeaseId> =
+            self.of(worker).filter(|&later| later > id).filter(is_idle).collect();
+        let in_work = self.held[&id].in_work();
+        let lost = self.lose(id, &in_work);
+        lost.into_iter()
+            .chain(idle.into_iter().filter_map(|id| self.lose(id, &BTreeSet::new())))
+            .collect()
+    }
+
+    /// Event: `worker` is gone and will not come back. Tiles that it had in work come under
+    /// suspicion if it `died`.
+    pub(crate) fn on_worker_lost(&mut self, worker: WorkerId, died: bool) -> Vec<Loss> {
+        let lost: Vec<LeaseId> = self.of(worker).collect();
+        // Where its threads were is not known before it tells; they begin with its first lease.
+        let is_known = lost.iter().any(|id| !self.held[id].begun.is_empty());
+        let mut losses = Vec::new();
+        for (index, id) in lost.into_iter().enumerate() {
+            let lease = &self.held[&id];
+            let may_be = if is_known { !lease.begun.is_empty() } else { index == 0 };
+            let in_work = if died && may_be { lease.in_work() } else { BTreeSet::new() };
+            losses.extend(self.lose(id, &in_work));
+        }
+        losses
     }
 
     /// Event: `worker` is to render no tile of `job` that it has not brought.
     pub(crate) fn on_suspicion(&mut self, worker: WorkerId, job: JobId) -> Vec<Loss> {
-        let of_worker = (worker, LeaseId(0))..=(worker, LeaseId(u64::MAX));
-        let leases = self.by_worker.range(of_worker).map(|&(_, id)| id);
-        let lost: Vec<LeaseId> = leases.filter(|id| self.held[id].job == job).collect();
-        lost.into_iter().filter_map(|id| self.lose(id)).collect()
+        let lost: Vec<LeaseId> = self.of(worker).filter(|id| self.held[id].job == job).collect();
+        lost.into_iter().filter_map(|id| self.lose(id, &BTreeSet::new())).collect()
     }
 
-    fn lose(&mut self, id: LeaseId) -> Option<Loss> {
-        let Lease { job, worker, alone, shared, .. } = self.remove(id)?;
-        let tiles = self.jobs.get_mut(&job)?;
-        for &place in alone.iter().chain(&shared) {
-            let Some(other) = tiles.give_back(place, id) else { continue };
-            // The other lease now holds the tile alone.
-            if let Some(lease) = self.held.get_mut(&other) {
-                lease.shared.remove(&place);
-                lease.alone.insert(place);
-                self.last_tiles.insert((lease.last_tile, other));
-            }
-        }
-        if tiles.free_count() > 0 {
-            self.with_free.insert(job);
-        }
+    /// Ends a lease; those of its tiles that were `in_work` come under suspicion.
+    fn lose(&mut self, id: LeaseId, in_work: &BTreeSet<Place>) -> Option<Loss> {
+        let Lease { job, worker, alone, shared, again, .. } = self.remove(id)?;
         let places = alone.into_iter().chain(shared).collect();
-        Some(Loss { lease: LeaseName { job, id }, worker, tiles: tiles.at(&places) })
+        self.give_back(LeaseName { job, id }, worker, [&places, &again], in_work)
+    }
+
+    /// Takes some tiles that stand still out of a lease that has others.
+    fn lose_tiles(&mut self, id: LeaseId, places: BTreeSet<Place>) -> Option<Loss> {
+        let lease = self.held.get_mut(&id)?;
+        let is_again = |place: &Place| lease.again.contains(place);
+        let (again, places) = places.into_iter().partition::<BTreeSet<Place>, _>(is_again);
+        for &place in places.iter().chain(&again) {
+            lease.drop_place(place);
+        }
+        let (job, worker) = (lease.job, lease.worker);
+        self.index(id);
+        self.give_back(LeaseName { job, id }, worker, [&places, &again], &places)
+    }
+
+    /// Frees tiles that a lease does not hold any more.
+    fn give_back(
+        &mut self,
+        lease: LeaseName,
+        worker: WorkerId,
+        [places, again]: [&BTreeSet<Place>; 2],
+        in_work: &BTreeSet<Place>,
+    ) -> Option<Loss> {
+        let tiles = &mut self.jobs.get_mut(&lease.job)?.tiles;
+        let mut others = Vec::new();
+        for &place in places {
+            if in_work.contains(&place) {
+                tiles.suspect(place);
+            }
+            others.extend(tiles.give_back(place, lease.id).map(|other| (place, other)));
+        }
+        let lost = tiles.at(&places.union(again).copied().collect());
+        let aside = tiles.aside().into_iter().filter(|tile| lost.contains(tile)).collect();
+        let again = tiles.at(again);
+        for (place, other) in others {
+            // The other lease now holds the tile alone.
+            if let Some(other) = self.held.get_mut(&other) {
+                other.shared.remove(&place);
+                other.alone.insert(place);
+            }
+            self.index(other);
+        }
+        self.index_job(lease.job);
+        Some(Loss { lease, worker, tiles: lost, aside, again })
     }
 
     /// Takes a lease out of the table and every index.
     fn remove(&mut self, id: LeaseId) -> Option<Lease> {
         let lease = self.held.remove(&id)?;
-        self.expiries.remove(&(lease.until, id));
-        self.last_tiles.remove(&(lease.last_tile, id));
+        self.expiries.remove(&(lease.expires, id));
+        if let Some(from) = lease.quiet_from {
+            self.quiet.remove(&(from, id));
+        }
         self.by_worker.remove(&(lease.worker, id));
         self.by_job.remove(&(lease.job, id));
         Some(lease)
+    }
+}
+
+impl Lease {
+    fn count(&self) -> usize {
+        self.alone.len() + self.shared.len() + self.again.len()
+    }
+
+    fn holds(&self, place: Place) -> bool {
+        [&self.alone, &self.shared, &self.again].iter().any(|places| places.contains(&place))
+    }
+
+    fn drop_place(&mut self, place: Place) {
+        for places in [&mut self.alone, &mut self.shared, &mut self.again] {
+            places.remove(&place);
+        }
+        self.begun.remove(&place);
+    }
+
+    /// Tiles on which its worker's threads are: those that it told of, or the first of all.
+    fn in_work(&self) -> BTreeSet<Place> {
+        let places = self.alone.union(&self.shared).copied();
+        if self.begun.is_empty() {
+            places.take(self.threads).collect()
+        } else {
+            self.begun.keys().copied().collect()
+        }
     }
 }
 
@@ -378,7 +671,7 @@ impl Leases {
     pub(crate) fn check(&self, is_member: impl Fn(WorkerId) -> bool) {
         assert!(self.held.values().all(|lease| is_member(lease.worker)));
         let mut held: BTreeMap<LeaseId, [BTreeSet<Place>; 2]> = BTreeMap::new();
-        for (job, tiles) in &self.jobs {
+        for (job, Job { tiles, .. }) in &self.jobs {
             for (place, holders) in tiles.check() {
                 let is_shared = usize::from(holders.iter().count() == 2);
                 for holder in holders.iter() {
@@ -387,25 +680,33 @@ impl Leases {
                 }
             }
             assert_eq!(self.with_free.contains(job), tiles.free_count() > 0);
+            assert_eq!(self.with_suspects.contains(job), tiles.has_suspect());
         }
-        assert!(self.with_free.iter().all(|job| self.jobs.contains_key(job)));
-        assert_eq!(held.len(), self.held.len(), "a lease holds at least one tile");
+        let mut with = self.with_free.union(&self.with_suspects);
+        assert!(with.all(|job| self.jobs.contains_key(job)));
         for (id, lease) in &self.held {
-            assert_eq!([&lease.alone, &lease.shared], held[id].each_ref());
+            assert!(lease.count() > 0, "a lease holds at least one tile");
+            let held = held.remove(id).unwrap_or_default();
+            assert_eq!([&lease.alone, &lease.shared], held.each_ref());
+            let tiles = lease.begun.values().map(|begun| begun.until);
+            assert_eq!(Some(lease.expires), tiles.chain([lease.until]).min());
+            assert!(lease.begun.keys().all(|&place| lease.holds(place)));
+            assert!(!lease.is_lone || self.of(lease.worker).count() == 1, "it has another");
         }
+        assert!(held.is_empty(), "a tile is in a lease that there is not");
         let leases = || self.held.iter();
-        assert!(self.expiries == leases().map(|(&id, lease)| (lease.until, id)).collect());
+        assert!(self.expiries == leases().map(|(&id, lease)| (lease.expires, id)).collect());
         assert!(self.by_worker == leases().map(|(&id, lease)| (lease.worker, id)).collect());
         assert!(self.by_job == leases().map(|(&id, lease)| (lease.job, id)).collect());
-        assert!(self.granted.keys().all(|job| self.jobs.contains_key(job)));
         for (id, lease) in &self.held {
-            let places = lease.alone.union(&lease.shared).copied().collect();
-            for tile in self.jobs[&lease.job].at(&places) {
+            let places = lease.alone.iter().chain(&lease.shared).chain(&lease.again);
+            let places = places.copied().collect();
+            for tile in self.jobs[&lease.job].tiles.at(&places) {
                 assert!(self.is_granted(lease.worker, LeaseName { job: lease.job, id: *id }, tile));
             }
         }
-        let alone = leases().filter(|(_, lease)| !lease.alone.is_empty());
-        assert!(self.last_tiles == alone.map(|(&id, lease)| (lease.last_tile, id)).collect());
+        let quiet = leases().filter(|(_, lease)| !lease.alone.is_empty() && !lease.is_lone);
+        assert!(self.quiet == quiet.map(|(&id, lease)| (lease.quiet_from.unwrap(), id)).collect());
     }
 
     fn is_empty(&self) -> bool {
@@ -420,6 +721,8 @@ mod tests {
     use super::*;
 
     const TERM: Duration = Duration::from_secs(4);
+    /// What a tile takes.
+    const COST: Duration = Duration::from_millis(200);
     const JOB: JobId = JobId(1);
     const A: WorkerId = WorkerId(1);
     const B: WorkerId = WorkerId(2);
@@ -428,8 +731,15 @@ mod tests {
         LeaseName { job: JOB, id: LeaseId(id) }
     }
 
+    /// News of the scene of a lease.
     fn renewal(id: u64, work: u64) -> Renewal {
-        Renewal { lease: lease(id), work }
+        Renewal { lease: lease(id), work, tiles: Vec::new() }
+    }
+
+    /// News of tiles of a lease, which all are so far.
+    fn news(id: u64, tiles: &[TileId], work: u64) -> Renewal {
+        let tiles = tiles.iter().map(|tile| (tile.number(), work)).collect();
+        Renewal { lease: lease(id), work: 0, tiles }
     }
 
     /// A job of `columns` x `rows` tiles.
@@ -445,7 +755,7 @@ mod tests {
     /// A job of a row of tiles, of which the first worker has leased all under lease 1.
     fn all_leased(tile_count: u64) -> (Leases, Vec<TileId>, Instant) {
         let (mut leases, start) = job(tile_count, 1);
-        let run = leases.on_idle(A, JOB, (8, 1), 64, start).unwrap();
+        let run = leases.on_idle(A, JOB, (16, 1), 64, start).unwrap();
         assert_eq!((run.lease, run.tiles.len() as u64), (lease(1), tile_count));
         assert!(!leases.has_free());
         (leases, run.tiles, start)
@@ -453,7 +763,7 @@ mod tests {
 
     /// Pixels of a tile that is open, and whose pixels are stored at once.
     fn deliver(leases: &mut Leases, worker: WorkerId, id: u64, tile: TileId, now: Instant) {
-        let arrival = leases.on_pixels(worker, lease(id), tile, [7; 32], now);
+        let arrival = leases.on_pixels(worker, lease(id), (tile, COST), [7; 32], now);
         assert!(matches!(arrival, Some(Arrival::First(..))), "{arrival:?}");
         leases.on_stored(JOB, tile).unwrap();
         leases.check(|_| true);
@@ -461,8 +771,8 @@ mod tests {
 
     /// From when on `worker` may render a tile of the quietest lease of others again.
     fn quiet_for(leases: &Leases, worker: WorkerId) -> Option<(Instant, LeaseId)> {
-        let mut others = leases.quietest().filter(|&(_, holder, _)| holder != worker);
-        others.next().map(|(from, _, name)| (from, name.id))
+        let mut others = leases.quietest().filter(|quiet| quiet.worker != worker);
+        others.next().map(|quiet| (quiet.from, quiet.lease.id))
     }
 
     #[test]
@@ -470,25 +780,26 @@ mod tests {
         let (mut leases, tiles, start) = all_leased(5);
         deliver(&mut leases, A, 1, tiles[0], start);
         assert_eq!(leases.on_time(start + TERM / 2), []);
-        assert!(leases.on_renewal(A, renewal(1, 1), start + TERM / 2));
+        assert!(leases.on_renewal(A, &news(1, &tiles[1..2], 1), start + TERM / 2));
         assert_eq!(leases.on_time(start + TERM), [], "progress renews it");
         assert_eq!(leases.next_expiry(), Some(start + TERM * 3 / 2));
 
         let lost = leases.on_time(start + TERM * 3 / 2);
         let rest = tiles[1..].to_vec();
-        assert_eq!(lost, [Loss { lease: lease(1), worker: A, tiles: rest.clone() }]);
+        let (aside, again) = (Vec::new(), Vec::new());
+        assert_eq!(lost, [Loss { lease: lease(1), worker: A, tiles: rest.clone(), aside, again }]);
         leases.check(|_| true);
-        assert!(!leases.on_renewal(A, renewal(1, 2), start + TERM * 2));
+        assert!(!leases.on_renewal(A, &renewal(1, 2), start + TERM * 2));
         let run = leases.on_idle(B, JOB, (8, 1), 64, start + TERM * 2).unwrap();
-        assert_eq!(run.tiles, rest);
+        assert_eq!(run.tiles, rest[1..], "the first was in work");
     }
 
     #[test]
     fn a_renewal_without_new_work_keeps_no_lease_alive() {
         let (mut leases, _, start) = all_leased(2);
-        assert!(leases.on_renewal(A, renewal(1, 7), start + TERM / 4));
+        assert!(leases.on_renewal(A, &renewal(1, 7), start + TERM / 4));
         for (work, quarter) in [(7, 2), (0, 3), (6, 4)] {
-            assert!(leases.on_renewal(A, renewal(1, work), start + TERM * quarter / 4));
+            assert!(leases.on_renewal(A, &renewal(1, work), start + TERM * quarter / 4));
         }
         assert_eq!(leases.on_time(start + TERM * 5 / 4).len(), 1);
     }
@@ -499,7 +810,7 @@ mod tests {
         for id in 1..=2 {
             assert_eq!(leases.on_idle(A, JOB, (1, 1), 1, start).unwrap().lease, lease(id));
         }
-        assert!(leases.on_renewal(A, renewal(2, 1), start + TERM / 2));
+        assert!(leases.on_renewal(A, &renewal(2, 1), start + TERM / 2));
         let lost = leases.on_time(start + TERM);
         assert_eq!(lost.iter().map(|loss| loss.lease).collect::<Vec<_>>(), [lease(1)]);
     }
@@ -512,7 +823,7 @@ mod tests {
         }
         for work in 1..9 {
             let now = start + TERM * work / 2;
-            assert!(leases.on_renewal(A, renewal(1, work.into()), now));
+            assert!(leases.on_renewal(A, &renewal(1, work.into()), now));
             assert_eq!(leases.on_time(now), [], "its tiles are not begun");
             leases.check(|_| true);
         }
@@ -531,16 +842,16 @@ mod tests {
     #[test]
     fn nobody_renews_the_lease_of_another_worker_or_job() {
         let (mut leases, _, start) = all_leased(2);
-        assert!(!leases.on_renewal(B, renewal(1, 1), start));
+        assert!(!leases.on_renewal(B, &renewal(1, 1), start));
         let other_job = LeaseName { job: JobId(2), ..lease(1) };
-        assert!(!leases.on_renewal(A, Renewal { lease: other_job, work: 1 }, start));
+        assert!(!leases.on_renewal(A, &Renewal { lease: other_job, ..renewal(1, 1) }, start));
         assert_eq!(leases.on_time(start + TERM).len(), 1);
     }
 
     #[test]
     fn late_pixels_of_a_lost_lease_are_the_first_copy() {
         let (mut leases, tiles, start) = all_leased(2);
-        leases.on_worker_lost(A);
+        leases.on_worker_lost(A, false);
         deliver(&mut leases, A, 1, tiles[0], start);
         let run = leases.on_idle(B, JOB, (8, 1), 64, start).unwrap();
         assert_eq!(run.tiles, tiles[1..]);
@@ -549,18 +860,20 @@ mod tests {
     #[test]
     fn a_second_copy_meets_the_first_ones_hash() {
         let (mut leases, tiles, start) = all_leased(1);
-        let copy =
-            |leases: &mut Leases, hash| leases.on_pixels(A, lease(1), tiles[0], [hash; 32], start);
+        let copy = |leases: &mut Leases, hash| {
+            leases.on_pixels(A, lease(1), (tiles[0], COST), [hash; 32], start)
+        };
         assert!(matches!(copy(&mut leases, 1), Some(Arrival::First(..))));
-        assert_eq!(copy(&mut leases, 2), Some(Arrival::WhileStoring([1; 32])));
+        let first = Rendering { worker: A, hash: [1; 32] };
+        assert_eq!(copy(&mut leases, 2), Some(Arrival::WhileStoring(first)));
         assert_eq!(leases.on_stored(JOB, tiles[0]), Some(1));
-        assert_eq!(copy(&mut leases, 2), Some(Arrival::AfterDone([1; 32])));
+        assert_eq!(copy(&mut leases, 2), Some(Arrival::AfterDone(first)));
     }
 
     #[test]
     fn a_quiet_lease_is_rendered_twice_from_its_end_and_once_only() {
         let (mut leases, tiles, start) = all_leased(2);
-        let later = start + QUIET;
+        let later = start + LONGEST_QUIET;
         assert_eq!(quiet_for(&leases, B), Some((later, LeaseId(1))));
         assert_eq!(quiet_for(&leases, A), None, "it is its own");
         for (id, &tile) in (2..).zip(tiles.iter().rev()) {
@@ -581,11 +894,11 @@ mod tests {
     fn a_tile_whose_second_rendering_is_lost_may_have_another() {
         let (mut leases, tiles, start) = all_leased(1);
         leases.on_idle_at_the_end(B, LeaseId(1), start).unwrap();
-        assert_eq!(leases.on_worker_lost(B).len(), 1);
+        assert_eq!(leases.on_worker_lost(B, false).len(), 1);
         leases.check(|_| true);
         assert!(!leases.has_free(), "its first holder still has it");
         let run = leases.on_idle_at_the_end(B, LeaseId(1), start).unwrap();
-        assert_eq!(leases.on_worker_lost(A).len(), 1);
+        assert_eq!(leases.on_worker_lost(A, false).len(), 1);
         leases.check(|_| true);
         deliver(&mut leases, B, run.lease.id.0, tiles[0], start);
         assert!(leases.is_empty());
@@ -597,21 +910,105 @@ mod tests {
         leases.on_end(JOB);
         leases.check(|_| true);
         assert!(leases.is_empty() && !leases.has_free());
-        assert!(!leases.on_renewal(A, renewal(1, 1), start));
-        assert_eq!(leases.on_pixels(A, lease(1), tiles[0], [0; 32], start), None);
+        assert!(!leases.on_renewal(A, &renewal(1, 1), start));
+        assert_eq!(leases.on_pixels(A, lease(1), (tiles[0], COST), [0; 32], start), None);
         assert_eq!(leases.on_stored(JOB, tiles[0]), None);
     }
 
     #[test]
-    fn runs_shorten_towards_the_end() {
-        let (mut leases, start) = job(100, 10);
-        let lengths: Vec<usize> =
-            std::iter::from_fn(|| leases.on_idle(A, JOB, (1, 4), 1000, start))
-                .map(|run| run.tiles.len())
-                .collect();
-        assert!(lengths.is_sorted_by(|a, b| a >= b), "{lengths:?}");
-        assert_eq!(lengths[0], LONGEST_RUN);
-        assert_eq!(lengths.last(), Some(&1));
-        assert_eq!(lengths.iter().sum::<usize>(), 1000);
+    fn runs_shorten_towards_the_end_and_are_shorter_for_the_slow() {
+        for (cost, longest) in [(COST, 118), (COST * 10, 12)] {
+            let (mut leases, start) = job(100, 10);
+            let first = leases.on_idle(A, JOB, (1, 4), 1000, start).unwrap();
+            assert_eq!(first.tiles.len(), FIRST_RUN, "nobody knows how slow it is");
+            // Another worker shows what tiles cost.
+            let of_others = leases.on_idle(B, JOB, (16, 16), 1000, start).unwrap();
+            for tile in of_others.tiles {
+                leases.on_pixels(B, of_others.lease, (tile, COST), [7; 32], start).unwrap();
+            }
+            let tile = (first.tiles[0], cost);
+            leases.on_pixels(A, first.lease, tile, [7; 32], start).unwrap();
+            let lengths: Vec<usize> =
+                std::iter::from_fn(|| leases.on_idle(A, JOB, (1, 4), 1000, start))
+                    .map(|run| run.tiles.len())
+                    .collect();
+            assert!(lengths.is_sorted_by(|a, b| a >= b), "{lengths:?}");
+            assert!((longest * 8 / 10..=longest * 14 / 10).contains(&lengths[0]), "{lengths:?}");
+            assert_eq!(lengths.last(), Some(&1));
+        }
+    }
+
+    #[test]
+    fn a_tile_that_stands_still_leaves_its_lease_which_lives_on() {
+        let (mut leases, tiles, start) = all_leased(6);
+        assert!(leases.on_renewal(A, &news(1, &tiles[..2], 1), start));
+        // The other thread goes on, and the first is said to be where it was.
+        for half in 1..=2 {
+            let told = Renewal {
+                tiles: vec![(tiles[0].number(), 1), (tiles[1].number(), 1 + half)],
+                ..news(1, &[], 0)
+            };
+            assert!(leases.on_renewal(A, &told, start + TERM * half as u32 / 2));
+        }
+        let now = start + TERM;
+        let lost = leases.on_time(now);
+        assert_eq!(lost.iter().map(|loss| &loss.tiles[..]).collect::<Vec<_>>(), [&tiles[..1]]);
+        leases.check(|_| true);
+        assert!(leases.on_renewal(A, &news(1, &tiles[..1], 2), now), "it has the others still");
+        assert!(leases.is_granted(A, lease(1), tiles[0]), "and its pixels are welcome");
+
+        assert!(leases.on_idle(B, JOB, (1, 1), 64, now).is_none(), "nothing free but a suspect");
+        let run = leases.on_trial(B, JOB, now).unwrap();
+        assert_eq!(run.tiles, tiles[..1]);
+        assert!(leases.is_on_trial(B) && !leases.is_on_trial(A));
+        leases.check(|_| true);
+        deliver(&mut leases, B, 2, tiles[0], now);
+        assert!(leases.is_without(B));
+    }
+
+    #[test]
+    fn a_tile_with_which_three_workers_are_lost_is_set_aside() {
+        let (mut leases, tiles, start) = all_leased(3);
+        assert!(leases.on_renewal(A, &news(1, &tiles[1..2], 1), start));
+        let [loss] = &leases.on_worker_lost(A, true)[..] else { panic!("it had one lease") };
+        assert_eq!((&loss.tiles, &loss.aside), (&tiles, &Vec::new()));
+        let others = leases.on_idle(A, JOB, (16, 1), 64, start).unwrap();
+        assert_eq!(others.tiles, [tiles[0], tiles[2]], "these were not begun");
+        for (worker, is_aside) in [(WorkerId(3), false), (WorkerId(4), true)] {
+            let run = leases.on_trial(worker, JOB, start).unwrap();
+            assert_eq!(run.tiles, tiles[1..2]);
+            assert_eq!(quiet_for(&leases, worker).unwrap().1, others.lease.id, "not this");
+            let [loss] = &leases.on_worker_lost(worker, true)[..] else { panic!("it had one") };
+            assert_eq!(loss.aside, if is_aside { tiles[1..2].to_vec() } else { Vec::new() });
+            leases.check(|_| true);
+        }
+        assert!(leases.on_trial(B, JOB, start).is_none() && !leases.has_free());
+        for tile in others.tiles {
+            deliver(&mut leases, A, 2, tile, start);
+        }
+        let of_job = leases.tiles(JOB).unwrap();
+        assert!(of_job.is_over() && of_job.aside() == tiles[1..2]);
+        deliver(&mut leases, A, 1, tiles[1], start);
+        assert_eq!(leases.tiles(JOB).unwrap().aside(), [], "however late");
+    }
+
+    #[test]
+    fn where_a_worker_was_is_guessed_when_it_has_not_told() {
+        let (mut leases, start) = job(8, 1);
+        let runs = [(); 2].map(|()| leases.on_idle(A, JOB, (2, 2), 64, start).unwrap());
+        assert_eq!(leases.on_worker_lost(A, true).len(), 2);
+        assert_eq!(leases.tiles(JOB).unwrap().free_count(), 6);
+        for expected in &runs[0].tiles[..2] {
+            assert_eq!(leases.on_trial(B, JOB, start).unwrap().tiles, [*expected]);
+        }
+        assert!(leases.on_trial(B, JOB, start).is_none());
+    }
+
+    #[test]
+    fn who_leaves_brings_no_tile_under_suspicion() {
+        let (mut leases, tiles, start) = all_leased(3);
+        assert!(leases.on_renewal(A, &news(1, &tiles, 1), start));
+        assert_eq!(leases.on_worker_lost(A, false).len(), 1);
+        assert!(leases.on_trial(B, JOB, start).is_none());
     }
 }

@@ -7,25 +7,38 @@
 //! knows only what stands before it:
 //!
 //! ```text
-//! identity, tiles <- lease, members, waiting <- farm, store, job <- shell <- service <- run
+//! identity, tiles, pace <- lease, members, waiting, audit <- farm, store, record <- state <- job
+//! job <- shell <- service <- run
 //! accept <- run
 //! ```
 
 mod accept;
+mod audit;
 mod farm;
 mod identity;
 mod job;
 mod lease;
+#[cfg(test)]
+mod load;
 mod members;
+mod pace;
+mod record;
+#[cfg(test)]
+mod restart;
 mod run;
 mod service;
 mod shell;
 #[cfg(test)]
 mod simulation;
+mod state;
+#[cfg(test)]
+mod steady;
 mod store;
 mod tiles;
 mod waiting;
 
+pub use accept::listen;
 pub use job::Job;
 pub use run::{Coordinator, Listener};
 pub use shell::{Config, SubmitError};
+pub use state::{Durability, StateError, StateFolder};

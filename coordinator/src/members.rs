@@ -24,6 +24,11 @@ pub(crate) struct Process {
 #[error("{0} is not a worker of this farm now; join again")]
 pub(crate) struct NoMember(pub(crate) WorkerId);
 
+/// A process that brought pixels which two other workers contradict. It gets no work any more.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+#[error("this process, as worker {0}, brought wrong pixels and is kept out of this farm")]
+pub(crate) struct KeptOut(pub(crate) WorkerId);
+
 /// The workers of a farm. Invariants: each member has one entry in every index; that in `checks`
 /// is never later than the moment when its silence becomes too long.
 #[derive(Debug)]
@@ -35,6 +40,9 @@ pub(crate) struct Members {
     by_process: BTreeSet<(u32, WorkerId)>,
     checks: BTreeSet<(Instant, WorkerId)>,
     threads: usize,
+    /// Liars, members once, and the nonces of their processes.
+    liars: BTreeSet<WorkerId>,
+    kept_out: BTreeMap<u64, WorkerId>,
 }
 
 #[derive(Debug)]
@@ -59,16 +67,25 @@ impl Members {
             by_process: BTreeSet::new(),
             checks: BTreeSet::new(),
             threads: 0,
+            liars: BTreeSet::new(),
+            kept_out: BTreeMap::new(),
         }
     }
 
     /// Event: a process joins. Its nonce tells a repeated question from a new process. Says also
     /// whether the member is new.
-    pub(crate) fn on_join(&mut self, process: &Process, now: Instant) -> (WorkerId, bool) {
+    pub(crate) fn on_join(
+        &mut self,
+        process: &Process,
+        now: Instant,
+    ) -> Result<(WorkerId, bool), KeptOut> {
+        if let Some(&liar) = self.kept_out.get(&process.nonce) {
+            return Err(KeptOut(liar));
+        }
         if let Some(&worker) = self.by_nonce.get(&process.nonce) {
             let is_member = self.on_sign_of_life(worker, now).is_ok();
             debug_assert!(is_member, "the index has members only");
-            return (worker, false);
+            return Ok((worker, false));
         }
         self.last_id.0 += 1;
         let worker = self.last_id;
@@ -84,7 +101,27 @@ impl Members {
         self.checks.insert((member.check_at, worker));
         self.threads += member.threads;
         self.by_id.insert(worker, member);
-        (worker, true)
+        Ok((worker, true))
+    }
+
+    /// Event: a worker is found to lie. Nothing that it brings is taken any more, and its process
+    /// is kept out once it is removed.
+    pub(crate) fn on_lie(&mut self, liar: WorkerId) {
+        self.liars.insert(liar);
+        if let Some(member) = self.by_id.get(&liar) {
+            self.kept_out.insert(member.nonce, liar);
+        }
+    }
+
+    /// Says whether a worker was found to lie.
+    pub(crate) fn is_liar(&self, worker: WorkerId) -> bool {
+        self.liars.contains(&worker)
+    }
+
+    /// The members from which something was heard at that time or later.
+    pub(crate) fn heard_since(&self, time: Instant) -> impl Iterator<Item = WorkerId> {
+        let members = self.by_id.iter().filter(move |(_, member)| member.last_heard >= time);
+        members.map(|(&worker, _)| worker)
     }
 
     /// Event: a worker says something.
@@ -192,10 +229,10 @@ mod tests {
     #[test]
     fn joining_again_with_the_same_nonce_changes_nothing() {
         let (mut members, now) = farm();
-        let (first, is_new) = members.on_join(&process(7), now);
+        let (first, is_new) = members.on_join(&process(7), now).unwrap();
         assert!(is_new);
-        assert_eq!(members.on_join(&process(7), now), (first, false));
-        let (second, is_new) = members.on_join(&process(8), now);
+        assert_eq!(members.on_join(&process(7), now), Ok((first, false)));
+        let (second, is_new) = members.on_join(&process(8), now).unwrap();
         assert!(is_new && second != first);
         assert_eq!(members.threads(first), (2, 4));
         members.check();
@@ -204,7 +241,7 @@ mod tests {
     #[test]
     fn a_sign_of_life_puts_off_the_end_of_a_member() {
         let (mut members, now) = farm();
-        let (worker, _) = members.on_join(&process(1), now);
+        let (worker, _) = members.on_join(&process(1), now).unwrap();
         members.on_sign_of_life(worker, now + SILENCE / 2).unwrap();
         assert_eq!(members.on_time(now + SILENCE), []);
         members.check();
@@ -218,10 +255,21 @@ mod tests {
     #[test]
     fn a_member_is_known_by_its_process() {
         let (mut members, now) = farm();
-        let (first, _) = members.on_join(&process(1), now);
-        let (second, _) = members.on_join(&process(2), now);
+        let (first, _) = members.on_join(&process(1), now).unwrap();
+        let (second, _) = members.on_join(&process(2), now).unwrap();
         assert_eq!((members.in_process(7), members.in_process(8)), (Some(first), None));
         members.remove(first);
         assert_eq!(members.in_process(7), Some(second));
+    }
+
+    #[test]
+    fn the_process_of_a_liar_is_kept_out() {
+        let (mut members, now) = farm();
+        let (liar, _) = members.on_join(&process(1), now).unwrap();
+        members.on_lie(liar);
+        assert!(members.remove(liar) && members.is_liar(liar));
+        assert_eq!(members.on_join(&process(1), now), Err(KeptOut(liar)));
+        assert!(members.on_join(&process(2), now).is_ok());
+        members.check();
     }
 }

@@ -7,7 +7,9 @@ use std::{
     time::Duration,
 };
 
+use rtfarm_core::tile::TileId;
 use rtfarm_job::Order;
+use rtfarm_picture::{Canvas, TileRecord};
 use rtfarm_proto::JobId;
 use tokio::{
     io::{AsyncRead, AsyncWrite},
@@ -24,6 +26,7 @@ use crate::{
     job::Job,
     service,
     shell::{Config, Shell, SubmitError},
+    state::StateFolder,
 };
 
 /// A coordinator. Clones are the same one.
@@ -47,14 +50,40 @@ const CLOSING: Duration = Duration::from_millis(1500);
 impl Coordinator {
     /// Makes a coordinator without jobs and workers, and draws its identity.
     pub fn new(config: Config) -> io::Result<Self> {
-        let mut random = [0; 24];
-        rustix::rand::getrandom(&mut random, rustix::rand::GetRandomFlags::empty())?;
-        Ok(Self { shell: Arc::new(Shell::new(config, Identity::from_random(random))) })
+        Self::draw(config, None)
+    }
+
+    /// Makes a coordinator without workers, which goes on with the farm and its jobs in `folder`.
+    pub fn with_state(config: Config, folder: StateFolder) -> io::Result<Self> {
+        Self::draw(config, Some(folder))
+    }
+
+    fn draw(config: Config, folder: Option<StateFolder>) -> io::Result<Self> {
+        let (mut random, mut secret) = ([0; 24], [0; 32]);
+        for bytes in [&mut random[..], &mut secret] {
+            rustix::rand::getrandom(bytes, rustix::rand::GetRandomFlags::empty())?;
+        }
+        let mut identity = Identity::from_random(random);
+        if let Some(folder) = &folder {
+            identity.farm = folder.farm();
+        }
+        Ok(Self { shell: Arc::new(Shell::new(config, identity, secret, folder)) })
     }
 
     /// Takes an order. This writes files: never call it on the async runtime.
     pub fn submit(&self, order: Order) -> Result<Arc<Job>, SubmitError> {
         self.shell.submit(order)
+    }
+
+    /// Takes an order whose picture is `canvas`, cut as the order says; these tiles are in it already.
+    /// This writes files: never call it on the async runtime.
+    pub fn submit_on(
+        &self,
+        order: Order,
+        canvas: Canvas,
+        done: &[(TileId, TileRecord)],
+    ) -> Result<Arc<Job>, SubmitError> {
+        self.shell.submit_on(self.shell.number_job(), order, canvas, done)
     }
 
     /// Ends a job, if it has not ended, and forgets it.
@@ -85,11 +114,15 @@ impl Coordinator {
             self.shell.stop.cancelled().await;
             tokio::time::sleep(CLOSING).await;
         };
-        tokio::select! {
+        let served = tokio::select! {
             served = serve => served,
             () = close => Ok(()),
             () = self.shell.keep_time() => unreachable!("time does not end"),
-        }
+            () = self.shell.keep_synced() => unreachable!("there is always more to write"),
+        };
+        let shell = Arc::clone(&self.shell);
+        tokio::task::spawn_blocking(move || shell.sync()).await.expect("syncing never panics");
+        served
     }
 }
 

@@ -14,14 +14,12 @@ use rtfarm_core::{
     render::Tally,
     tile::{Crop, Size},
 };
-use rtfarm_job::{Outcome, Placed, Progress, Refusal, RenderRequest};
-use rtfarm_picture::check_pixels;
+use rtfarm_job::{Outcome, Placed, Refusal, RenderRequest};
+use rtfarm_picture::TilePixels;
 use rtfarm_proto::{
     CHUNK_BYTES, JobId, LONGEST_WAIT, LeaseName, MESSAGE_BYTES, PROTOCOL, Renewal, WireError,
-    WorkerId, pixels_from_bytes, scene_hash, transfer,
-    wire::{
-        self, event, farm_server, jobs_server, lease_response, submit_request, submit_response,
-    },
+    WorkerId, scene_hash, transfer,
+    wire::{self, farm_server, jobs_server, lease_response, submit_request, submit_response},
 };
 use tokio::sync::{mpsc, oneshot};
 use tokio_stream::{Stream, wrappers::ReceiverStream};
@@ -40,7 +38,8 @@ use crate::{
     job::Job,
     lease::Run,
     members::{NoMember, Process},
-    shell::Shell,
+    record::to_event,
+    shell::{Config, Shell},
     tiles::PixelHash,
 };
 
@@ -56,6 +55,8 @@ type Events = Pin<Box<dyn Stream<Item = Result<wire::Event, Status>> + Send>>;
 /// Both services over one coordinator.
 pub(crate) fn router(shell: &Arc<Shell>) -> Router {
     const WINDOW_BYTES: u32 = 1 << 22;
+    // A frame of a delivery; each costs both sides a call of the system.
+    const FRAME_BYTES: u32 = 1 << 17;
     let farm = farm_server::FarmServer::new(FarmService { shell: Arc::clone(shell) })
         .max_decoding_message_size(MESSAGE_BYTES)
         .max_encoding_message_size(MESSAGE_BYTES);
@@ -65,6 +66,7 @@ pub(crate) fn router(shell: &Arc<Shell>) -> Router {
     Server::builder()
         .initial_stream_window_size(WINDOW_BYTES)
         .initial_connection_window_size(WINDOW_BYTES)
+        .max_frame_size(FRAME_BYTES)
         .http2_keepalive_interval(Some(Duration::from_secs(10)))
         .http2_keepalive_timeout(Some(Duration::from_secs(20)))
         .add_service(farm)
@@ -81,11 +83,13 @@ impl farm_server::Farm for FarmService {
         &self,
         request: Request<wire::JoinRequest>,
     ) -> Result<Response<wire::JoinResponse>, Status> {
-        let wire::JoinRequest { version, protocol, nonce, threads, isa, host, process } =
-            request.into_inner();
-        check_version("worker", &version, protocol, &self.shell)?;
+        let request = request.into_inner();
+        check_version("worker", &request.version, request.protocol, &self.shell)?;
+        check_pixels_of(&request, &self.shell)?;
+        let wire::JoinRequest { nonce, threads, isa, host, process, .. } = request;
         let threads = threads as usize;
         let worker = self.shell.join(Process { nonce, number: process, threads, host, isa });
+        let worker = worker.map_err(|error| Status::failed_precondition(error.to_string()))?;
         let term_ms = u32::try_from(self.shell.config.term.as_millis()).unwrap_or(u32::MAX);
         Ok(Response::new(wire::JoinResponse {
             worker: worker.0,
@@ -100,10 +104,17 @@ impl farm_server::Farm for FarmService {
         request: Request<wire::LeaseRequest>,
     ) -> Result<Response<wire::LeaseResponse>, Status> {
         let is_local = request.extensions().get::<UdsConnectInfo>().is_some();
-        let wire::LeaseRequest { worker, max_tiles, wait_ms, incarnation } = request.into_inner();
+        let wire::LeaseRequest { worker, max_tiles, wait_ms, incarnation, kept } =
+            request.into_inner();
         self.shell.admit(incarnation).map_err(stranger)?;
         let wait = Duration::from_millis(wait_ms.into()).min(LONGEST_WAIT);
-        let next = self.shell.ask(WorkerId(worker), max_tiles as usize, wait).await;
+        let worker_id = WorkerId(worker);
+        let offered =
+            kept.and_then(|kept| self.shell.offer(worker_id, JobId(kept.job), &kept.tiles));
+        let next = match offered {
+            Some(run) => Ok(Next::Render(run)),
+            None => self.shell.ask(worker_id, max_tiles as usize, wait).await,
+        };
         let next = match next.map_err(no_member)? {
             Next::Render(run) => {
                 tracing::debug!(worker, ?run, "leased");
@@ -136,20 +147,18 @@ impl farm_server::Farm for FarmService {
         request: Request<wire::DeliverRequest>,
     ) -> Result<Response<wire::DeliverResponse>, Status> {
         let shell = Arc::clone(&self.shell);
-        let delivery = request.into_inner();
-        self.shell.admit(delivery.incarnation).map_err(stranger)?;
-        let (worker, tile) = (delivery.worker, delivery.tile);
-        let verdict = match blocking(move || take(&shell, &delivery)).await? {
-            Some(verdict) => verdict.await.expect("every delivery is answered"),
-            None => Verdict::Rejected,
-        };
-        tracing::debug!(worker, tile, ?verdict, "answered");
-        let verdict = match verdict {
-            Verdict::Accepted => wire::Verdict::Accepted,
-            Verdict::Duplicate => wire::Verdict::Duplicate,
-            Verdict::Rejected => wire::Verdict::Rejected,
-        };
-        Ok(Response::new(wire::DeliverResponse { verdict: verdict.into() }))
+        let wire::DeliverRequest { worker, incarnation, tiles } = request.into_inner();
+        self.shell.admit(incarnation).map_err(stranger)?;
+        let mut verdicts = vec![wire::Verdict::Rejected.into(); tiles.len()];
+        let taken = blocking(move || take(&shell, WorkerId(worker), tiles)).await?;
+        if let Some((places, decided)) = taken {
+            let decided = decided.await.expect("every delivery is answered");
+            for (place, verdict) in places.into_iter().zip(decided) {
+                verdicts[place] = to_verdict(verdict).into();
+            }
+        }
+        tracing::debug!(worker, ?verdicts, "answered");
+        Ok(Response::new(wire::DeliverResponse { verdicts }))
     }
 
     async fn leave(
@@ -173,34 +182,55 @@ impl farm_server::Farm for FarmService {
         let hash = scene_hash(&hash).map_err(invalid)?;
         let job = self.shell.job_with_scene(hash);
         let job = job.ok_or_else(|| Status::not_found("no job has this scene now"))?;
-        let file = std::fs::File::open(job.scene.path()).map_err(|error| broken(&error))?;
+        let file = std::fs::File::open(job.scene.path()).map_err(|error| match error.kind() {
+            // The job was forgotten a moment ago.
+            io::ErrorKind::NotFound => Status::not_found("no job has this scene now"),
+            _ => broken(&error),
+        })?;
         Ok(Response::new(stream_file(file, job)))
     }
 }
 
-/// Reads a delivery and hands it on. `None` when there is no such tile, or the pixels are none of
-/// it. This hashes and writes: never call it on the async runtime.
+/// The places in a message of tiles that were handed on, and what is decided about each of them.
+type Taken = (Vec<usize>, oneshot::Receiver<Vec<Verdict>>);
+
+/// Reads tiles and hands on those that there are and whose pixels make sense. `None` when none does.
+/// This hashes and writes: never call it on the async runtime.
 fn take(
     shell: &Shell,
-    request: &wire::DeliverRequest,
-) -> Result<Option<oneshot::Receiver<Verdict>>, Status> {
-    let lease = request.lease.ok_or_else(|| invalid(WireError::Missing("lease")))?;
-    let (worker, lease) = (WorkerId(request.worker), LeaseName::from(lease));
-    let Some((tile, job)) = shell.tile(lease.job, request.tile) else { return Ok(None) };
-    let hash: PixelHash = job.hasher.hash(tile, &request.pixels);
-    let pixels = pixels_from_bytes(&request.pixels).map_err(invalid)?;
-    let tally = request.tally.ok_or_else(|| invalid(WireError::Missing("tally")))?;
-    let tally = Tally::try_from(tally).map_err(invalid)?;
-    if request.hash != hash[..] {
-        tracing::error!(worker = worker.0, tile = tile.number(), "pixels were damaged");
-        return Err(Status::data_loss("the pixels do not have the hash they came with"));
+    worker: WorkerId,
+    tiles: Vec<wire::FinishedTile>,
+) -> Result<Option<Taken>, Status> {
+    let (mut places, mut good) = (Vec::new(), Vec::with_capacity(tiles.len()));
+    for (place, finished) in tiles.into_iter().enumerate() {
+        let lease = finished.lease.ok_or_else(|| invalid(WireError::Missing("lease")))?;
+        let lease = LeaseName::from(lease);
+        let Some((tile, job)) = shell.tile(lease.job, finished.tile) else { continue };
+        let hash: PixelHash = job.hasher.hash(tile, &finished.pixels);
+        let tally = finished.tally.ok_or_else(|| invalid(WireError::Missing("tally")))?;
+        let tally = Tally::try_from(tally).map_err(invalid)?;
+        if finished.hash != hash[..] {
+            tracing::error!(worker = worker.0, tile = tile.number(), "pixels were damaged");
+            return Err(Status::data_loss("the pixels do not have the hash they came with"));
+        }
+        let pixels = TilePixels { area: job.grid.area(tile), bytes: &finished.pixels };
+        if let Err(error) = pixels.check() {
+            shell.report_senseless_pixels(worker, lease, tile, &error.to_string());
+            continue;
+        }
+        places.push(place);
+        let delivery = Delivery { worker, lease, tile, hash, seconds: finished.seconds, tally };
+        good.push((delivery, finished.pixels));
     }
-    if let Err(error) = check_pixels(job.grid.area(tile), &pixels) {
-        shell.report_senseless_pixels(worker, lease, tile, &error.to_string());
-        return Ok(None);
+    Ok((!good.is_empty()).then(|| (places, shell.deliver(good))))
+}
+
+fn to_verdict(verdict: Verdict) -> wire::Verdict {
+    match verdict {
+        Verdict::Accepted => wire::Verdict::Accepted,
+        Verdict::Duplicate => wire::Verdict::Duplicate,
+        Verdict::Rejected => wire::Verdict::Rejected,
     }
-    let delivery = Delivery { worker, lease, tile, hash, seconds: request.seconds, tally };
-    Ok(Some(shell.deliver(delivery, pixels)))
 }
 
 struct JobsService {
@@ -244,7 +274,6 @@ impl jobs_server::Jobs for JobsService {
                     frame: Some(job.grid.window().size().into()),
                     tile_count: job.grid.count(),
                     farm: identity.farm.0.to_vec().into(),
-                    incarnation: identity.incarnation.0,
                 }),
                 Err(Refusal::Scene) => submit_response::Outcome::Refused(String::new()),
                 Err(Refusal::Other(reason)) => submit_response::Outcome::Refused(reason),
@@ -264,8 +293,8 @@ impl jobs_server::Jobs for JobsService {
         &self,
         request: Request<wire::WatchRequest>,
     ) -> Result<Response<Events>, Status> {
-        let wire::WatchRequest { job, incarnation } = request.into_inner();
-        let job = self.known_job(job, incarnation)?;
+        let wire::WatchRequest { job, farm } = request.into_inner();
+        let job = self.job(job, &farm)?;
         let mut progress = job.progress();
         let (send, receive) = mpsc::channel(1);
         tokio::spawn(async move {
@@ -291,12 +320,8 @@ impl jobs_server::Jobs for JobsService {
         &self,
         request: Request<wire::ImageRequest>,
     ) -> Result<Response<Chunks>, Status> {
-        let wire::ImageRequest { job, incarnation } = request.into_inner();
-        // Who only knows a job's number may have its picture: no other start has that number.
-        let job = match incarnation {
-            0 => self.job(job)?,
-            _ => self.known_job(job, incarnation)?,
-        };
+        let wire::ImageRequest { job, farm } = request.into_inner();
+        let job = self.job(job, &farm)?;
         if !matches!(job.progress.borrow().outcome, Some(Outcome::Finished(_))) {
             return Err(Status::failed_precondition("the job has not finished"));
         }
@@ -306,7 +331,7 @@ impl jobs_server::Jobs for JobsService {
             move || {
                 let encode = || {
                     let mut file = BufWriter::new(tempfile::tempfile_in(folder)?);
-                    job.picture.encode(&mut file)?;
+                    job.picture().encode(&mut file)?;
                     let mut file = file.into_inner().map_err(io::IntoInnerError::into_error)?;
                     file.rewind()?;
                     Ok(file)
@@ -322,20 +347,16 @@ impl jobs_server::Jobs for JobsService {
         &self,
         request: Request<wire::CancelRequest>,
     ) -> Result<Response<wire::CancelResponse>, Status> {
-        let wire::CancelRequest { job, incarnation } = request.into_inner();
-        self.shell.admit(incarnation).map_err(stranger)?;
+        let wire::CancelRequest { job, farm } = request.into_inner();
+        self.shell.admit_client(&farm).map_err(stranger)?;
         self.shell.cancel(JobId(job));
         Ok(Response::new(wire::CancelResponse {}))
     }
 }
 
 impl JobsService {
-    fn known_job(&self, job: u64, incarnation: u64) -> Result<Arc<Job>, Status> {
-        self.shell.admit(incarnation).map_err(stranger)?;
-        self.job(job)
-    }
-
-    fn job(&self, job: u64) -> Result<Arc<Job>, Status> {
+    fn job(&self, job: u64, farm: &[u8]) -> Result<Arc<Job>, Status> {
+        self.shell.admit_client(farm).map_err(stranger)?;
         let job = self.shell.job(JobId(job));
         job.ok_or_else(|| Status::not_found("there is no such job"))
     }
@@ -425,22 +446,6 @@ fn to_request(order: wire::Order) -> Result<RenderRequest, WireError> {
     Ok(RenderRequest { name, strict, size, crop, quality, tile_side, transfer, format })
 }
 
-fn to_event(progress: &Progress) -> wire::Event {
-    wire::Event {
-        tiles_done: progress.tiles_done,
-        tile_count: progress.tile_count,
-        tally: Some(progress.tally.into()),
-        workers: progress.worker_count,
-        differing_tiles: progress.differing_tiles,
-        end: progress.outcome.as_ref().map(|outcome| match outcome {
-            Outcome::Finished(time) => {
-                event::End::Finished(wire::Finished { seconds: time.as_secs_f64() })
-            }
-            Outcome::Failed(reason) => event::End::Failed(reason.clone()),
-        }),
-    }
-}
-
 /// Tells a worker all about its tiles; one on this machine also where the scene is.
 fn to_run(run: &Run, job: &Job, is_local: bool) -> wire::Run {
     let path = job.scene.path().to_str().filter(|_| is_local);
@@ -503,6 +508,29 @@ fn check_version(who: &str, version: &str, protocol: u32, shell: &Shell) -> Resu
         "this {who} is rtfarm {version} (protocol {protocol}), the coordinator is rtfarm {ours} \
          (protocol {PROTOCOL}); both must be the same"
     )))
+}
+
+/// Refuses a worker whose pixels would be others than the coordinator's workers' should be.
+fn check_pixels_of(request: &wire::JoinRequest, shell: &Shell) -> Result<(), Status> {
+    let wire::JoinRequest { host, isa, build, reference, .. } = request;
+    let Config { build: our_build, reference: ours, .. } = &shell.config;
+    let reason = if build != our_build {
+        format!(
+            "this worker was built from other sources (build `{build}`) than the coordinator \
+             (build `{our_build}`); build both from the same"
+        )
+    } else if let Some(ours) = ours
+        && reference != &ours[..]
+    {
+        format!(
+            "this worker, with {isa}, makes other pixels of the reference tile than the coordinator; \
+             its compiler or its processor errs"
+        )
+    } else {
+        return Ok(());
+    };
+    tracing::warn!(host, reason, "refused a worker");
+    Err(Status::failed_precondition(reason))
 }
 
 #[expect(clippy::needless_pass_by_value, reason = "`map_err` hands it over")]

@@ -12,18 +12,22 @@ use std::{
 
 use rtfarm_core::{prepared::SceneHash, tile::TileId};
 use rtfarm_job::{FinishedTile, Order, Progress};
-use rtfarm_picture::Picture;
-use rtfarm_proto::{Incarnation, JobId, LeaseName, Renewal, TileHasher, WorkerId};
-use tokio::sync::{Notify, oneshot, watch};
+use rtfarm_picture::{Canvas, CanvasTile, TileRecord};
+use rtfarm_proto::{Bytes, Incarnation, JobId, LeaseName, Renewal, WorkerId};
+use tokio::sync::{Notify, oneshot};
 use tokio_util::sync::CancellationToken;
 
 use crate::{
-    farm::{Action, Delivery, DeliveryId, Farm, Next, Notice, Verdict},
+    audit::Audit,
+    farm::{Action, Delivery, DeliveryId, Earlier, Farm, Next, Notice, Verdict},
     identity::{Identity, Stranger},
     job::Job,
-    members::{NoMember, Process},
+    lease::Run,
+    members::{KeptOut, NoMember, Process},
+    record::Plan,
+    state::{Durability, KeptJob, StateFolder},
     store::SceneFile,
-    tiles::Tiles,
+    tiles::{MOST_LOSSES, Tiles},
     waiting::{Ask, AskId},
 };
 
@@ -32,8 +36,16 @@ use crate::{
 pub struct Config {
     /// Workers and clients of another version are refused.
     pub version: String,
+    /// Of the sources that pixels depend on. Workers of another are refused.
+    pub build: String,
+    /// What the reference tile hashes to. Workers that make another of it are refused, unless there
+    /// is none here.
+    pub reference: Option<[u8; 32]>,
     /// How long a lease lives without progress.
     pub term: Duration,
+    /// Of the tiles, from 0 to 1, that another worker renders again, to compare; besides those each
+    /// worker's first of a job, unless this is 0.
+    pub audit: f64,
     /// A client that sends nothing of its scene for this long is given up.
     pub upload_silence: Duration,
     /// For prepared scenes: a folder that is nobody else's.
@@ -51,6 +63,9 @@ pub enum SubmitError {
     /// The picture cannot be made.
     #[error("cannot make the picture's file in {folder}: {error}", folder = .0.display(), error = .1)]
     Picture(PathBuf, io::Error),
+    /// The job cannot be kept.
+    #[error("cannot keep the job in the farm's state: {0}")]
+    State(io::Error),
 }
 
 /// The machine and all that its answers concern.
@@ -58,6 +73,12 @@ pub enum SubmitError {
 pub(crate) struct Shell {
     pub(crate) identity: Identity,
     pub(crate) config: Config,
+    /// Where jobs outlive this process.
+    folder: Option<StateFolder>,
+    /// What was written and a power cut may still take.
+    unsynced: Mutex<BTreeMap<JobId, Unsynced>>,
+    /// Told when there is such.
+    written: Notify,
     /// Held for a moment: nothing is written and nobody is waited for under it.
     state: Mutex<State>,
     /// Told when the machine wants to be woken earlier than it will be.
@@ -73,52 +94,100 @@ struct State {
     jobs: BTreeMap<JobId, Arc<Job>>,
     /// Questions that the machine has not answered.
     asks: HashMap<AskId, oneshot::Sender<Result<Next, NoMember>>>,
-    /// Deliveries that the machine has not answered.
-    deliveries: HashMap<DeliveryId, Undecided>,
+    /// What workers brought and the machine has not answered, by the number of its first tile.
+    batches: BTreeMap<DeliveryId, Batch>,
     /// The number of the last question or delivery.
     last_number: u64,
     /// When the machine will be woken.
     wakes_at: Option<Instant>,
 }
 
+/// Tiles that came in one message. Their deliveries have consecutive numbers.
 #[derive(Debug)]
-struct Undecided {
-    /// Taken out when they are stored.
-    pixels: Vec<[f32; 3]>,
-    reply: oneshot::Sender<Verdict>,
+struct Batch {
+    deliveries: Vec<Delivery>,
+    /// Of each tile. They are taken out when they are stored.
+    pixels: Vec<Bytes>,
+    verdicts: Vec<Verdict>,
+    undecided_count: usize,
+    reply: oneshot::Sender<Vec<Verdict>>,
+}
+
+#[derive(Debug)]
+struct Unsynced {
+    job: Arc<Job>,
+    /// Tiles that are acknowledged only when a power cut cannot take them.
+    tiles: Vec<TileId>,
 }
 
 /// What is done after the state is unlocked, since it may take a while.
+#[derive(Default)]
+struct Works {
+    in_order: Vec<Work>,
+    /// How far jobs are, for those who watch them: the last word only, after all else.
+    progress: BTreeMap<JobId, (Arc<Job>, Progress)>,
+}
+
 enum Work {
-    Log(Notice),
-    Publish(Arc<Job>, Progress),
-    Store {
-        job: Arc<Job>,
-        tile: TileId,
-        pixels: Vec<[f32; 3]>,
-    },
+    Log(Box<Notice>),
+    /// Writes tiles into a job's picture.
+    Store(Arc<Job>, Vec<(TileId, Bytes, TileRecord)>),
+    /// Forgets what is kept of tiles.
+    TakeBack(Arc<Job>, Vec<TileId>),
     /// Removes the files of a job that nobody else has in hand.
     Drop(Arc<Job>),
 }
 
+impl Works {
+    /// Has a tile written, together with those before it.
+    fn store(&mut self, job: &Arc<Job>, tile: (TileId, Bytes, TileRecord)) {
+        match self.in_order.last_mut() {
+            Some(Work::Store(last, tiles)) if last.id == job.id => tiles.push(tile),
+            _ => self.in_order.push(Work::Store(Arc::clone(job), vec![tile])),
+        }
+    }
+}
+
+/// How long a power cut may lose what was acknowledged.
+const SYNC_PERIOD: Duration = Duration::from_secs(1);
+
 impl Shell {
-    /// Makes a farm without jobs and workers.
-    pub(crate) fn new(config: Config, identity: Identity) -> Self {
+    /// Makes a farm without workers, and without jobs but those that are kept in `folder`.
+    /// `secret` chooses the tiles that are compared.
+    pub(crate) fn new(
+        config: Config,
+        identity: Identity,
+        secret: [u8; 32],
+        mut folder: Option<StateFolder>,
+    ) -> Self {
+        let audit = Audit::new(config.audit, secret);
+        let farm = match &folder {
+            Some(folder) => Farm::keeping_jobs(identity, config.term, audit, folder.last_job()),
+            None => Farm::new(identity, config.term, audit),
+        };
+        let kept = folder.as_mut().map(|folder| std::mem::take(&mut folder.kept));
         let state = State {
-            farm: Farm::new(identity, config.term),
+            farm,
             jobs: BTreeMap::new(),
             asks: HashMap::new(),
-            deliveries: HashMap::new(),
+            batches: BTreeMap::new(),
             last_number: 0,
             wakes_at: None,
         };
-        Self {
+        let shell = Self {
             identity,
             config,
+            folder,
+            unsynced: Mutex::default(),
+            written: Notify::new(),
             state: Mutex::new(state),
             earlier: Notify::new(),
             stop: CancellationToken::new(),
+        };
+        for job in kept.into_iter().flatten() {
+            shell.take_up(job);
         }
+        shell
     }
 
     fn state(&self) -> MutexGuard<'_, State> {
@@ -127,13 +196,14 @@ impl Shell {
 
     /// Hands an event to the machine and does what it answers.
     fn tell<T>(&self, event: impl FnOnce(&mut State, Instant) -> (T, Vec<Action>)) -> T {
-        let mut works = Vec::new();
+        let mut works = Works::default();
         let value = {
             let mut state = self.state();
             // Under the lock, so that the machine's time never runs backwards.
             let (value, actions) = event(&mut state, tokio::time::Instant::now().into_std());
+            let now = tokio::time::Instant::now().into_std();
             for action in actions {
-                works.extend(self.act(&mut state, action));
+                self.act(&mut state, action, &mut works, now);
             }
             let wake = state.farm.next_wake();
             if wake.is_some_and(|wake| state.wakes_at.is_none_or(|at| wake < at)) {
@@ -142,8 +212,11 @@ impl Shell {
             }
             value
         };
-        for work in works {
+        for work in works.in_order {
             self.do_work(work);
+        }
+        for (job, progress) in works.progress.into_values() {
+            job.publish(progress);
         }
         value
     }
@@ -153,7 +226,7 @@ impl Shell {
     }
 
     /// Does at once what must be done in the order decided, and is quick.
-    fn act(&self, state: &mut State, action: Action) -> Option<Work> {
+    fn act(&self, state: &mut State, action: Action, works: &mut Works, now: Instant) {
         match action {
             Action::Answer(ask, answer) => {
                 if let Some(reply) = state.asks.remove(&ask) {
@@ -161,41 +234,122 @@ impl Shell {
                     let _ = reply.send(answer);
                 }
             }
-            Action::Acknowledge(delivery, verdict) => {
-                if let Some(undecided) = state.deliveries.remove(&delivery) {
-                    // The worker may have gone; another delivers the tile again.
-                    let _ = undecided.reply.send(verdict);
+            Action::Acknowledge(delivery, verdict) => state.acknowledge(delivery, verdict),
+            Action::Publish(job, progress) => {
+                if let Some(known) = state.jobs.get(&job) {
+                    works.progress.insert(job, (Arc::clone(known), progress));
                 }
             }
-            Action::Publish(job, progress) => {
-                let job = state.jobs.get(&job)?;
-                return Some(Work::Publish(Arc::clone(job), progress));
-            }
             Action::Store(delivery, job, tile) => {
-                let job = Arc::clone(state.jobs.get(&job)?);
-                let pixels = std::mem::take(&mut state.deliveries.get_mut(&delivery)?.pixels);
-                return Some(Work::Store { job, tile, pixels });
+                let so_far = state.farm.so_far(job, now);
+                let known = state.jobs.get(&job).cloned();
+                if let (Some((batch, index)), Some(job), Some((elapsed, worker_count))) =
+                    (state.batch(delivery), known, so_far)
+                {
+                    let pixels = std::mem::take(&mut batch.pixels[index]);
+                    let Delivery { hash, tally, seconds, .. } = batch.deliveries[index];
+                    let record = TileRecord {
+                        arrived: hash,
+                        tally,
+                        seconds: seconds as f32,
+                        elapsed: elapsed.as_secs_f32(),
+                        worker_count,
+                    };
+                    works.store(&job, (tile, pixels, record));
+                }
             }
-            Action::Forget(job) => return state.jobs.remove(&job).map(Work::Drop),
-            Action::Log(notice) => return Some(Work::Log(notice)),
+            Action::TakeBack(job, tiles) => {
+                let job = state.jobs.get(&job).cloned();
+                works.in_order.extend(job.map(|job| Work::TakeBack(job, tiles)));
+            }
+            Action::Forget(job) => {
+                works.in_order.extend(state.jobs.remove(&job).map(Work::Drop));
+            }
+            Action::Log(notice) => works.in_order.push(Work::Log(Box::new(notice))),
             Action::Stop => self.stop.cancel(),
         }
-        None
     }
 
     fn do_work(&self, work: Work) {
         match work {
-            Work::Log(notice) => log(notice),
-            Work::Publish(job, progress) => job.publish(progress),
-            Work::Drop(job) => drop(job),
-            Work::Store { job, tile, pixels } => {
-                match job.picture.put(job.grid.area(tile), &pixels) {
-                    Ok(()) => self.tell_farm(|farm, now| farm.on_stored(job.id, tile, now)),
+            Work::Log(notice) => log(*notice),
+            Work::Drop(job) => job.forget(),
+            Work::TakeBack(job, tiles) => {
+                if let Err(error) = job.canvas.clear(&tiles) {
+                    self.tell_farm(|farm, _| farm.on_store_failed(job.id, error.to_string()));
+                }
+            }
+            Work::Store(job, tiles) => {
+                let put = tiles.iter().map(|&(tile, ref bytes, record)| CanvasTile {
+                    tile,
+                    bytes,
+                    record,
+                });
+                let numbers: Vec<TileId> = tiles.iter().map(|&(tile, ..)| tile).collect();
+                match job.canvas.put_all(&put.collect::<Vec<_>>()) {
+                    Ok(()) => self.on_written(&job, &numbers),
                     Err(error) => {
                         self.tell_farm(|farm, _| farm.on_store_failed(job.id, error.to_string()));
                     }
                 }
             }
+        }
+    }
+
+    /// Tiles are written: a kill cannot take them any more.
+    fn on_written(&self, job: &Arc<Job>, tiles: &[TileId]) {
+        let is_safe = match &self.folder {
+            Some(folder) => folder.durability == Durability::Second,
+            None => true,
+        };
+        if job.canvas.is_kept() {
+            let mut unsynced = self.unsynced.lock().expect("nothing here panics");
+            let entry = unsynced.entry(job.id);
+            let entry =
+                entry.or_insert_with(|| Unsynced { job: Arc::clone(job), tiles: Vec::new() });
+            if !is_safe {
+                entry.tiles.extend(tiles);
+            }
+            self.written.notify_one();
+        }
+        if is_safe {
+            self.on_stored(job.id, tiles);
+        }
+    }
+
+    fn on_stored(&self, job: JobId, tiles: &[TileId]) {
+        if !tiles.is_empty() {
+            self.tell_farm(|farm, now| {
+                tiles.iter().flat_map(|&tile| farm.on_stored(job, tile, now)).collect()
+            });
+        }
+    }
+
+    /// Makes all that was written outlive a power cut. Never call this on the async runtime.
+    pub(crate) fn sync(&self) {
+        let unsynced = std::mem::take(&mut *self.unsynced.lock().expect("nothing here panics"));
+        for Unsynced { job, tiles } in unsynced.into_values() {
+            match job.canvas.sync() {
+                Ok(()) => self.on_stored(job.id, &tiles),
+                Err(error) => {
+                    let reason = format!("cannot make the picture safe: {error}");
+                    self.tell_farm(|farm, _| farm.on_store_failed(job.id, reason));
+                }
+            }
+        }
+    }
+
+    /// Makes what is written outlive a power cut, again and again. Does not return.
+    pub(crate) async fn keep_synced(self: &Arc<Self>) {
+        let is_lazy =
+            self.folder.as_ref().is_none_or(|folder| folder.durability == Durability::Second);
+        loop {
+            self.written.notified().await;
+            if is_lazy {
+                tokio::time::sleep(SYNC_PERIOD).await;
+            }
+            let shell = Arc::clone(self);
+            tokio::task::spawn_blocking(move || shell.sync()).await.expect("syncing never panics");
         }
     }
 
@@ -225,7 +379,15 @@ impl Shell {
         self.tell(|state, _| state.farm.on_call(Incarnation(incarnation)))
     }
 
-    pub(crate) fn join(&self, process: Process) -> WorkerId {
+    /// Lets a client's call in that is meant for this farm. Who knows only the number of a job names
+    /// none.
+    pub(crate) fn admit_client(&self, farm: &[u8]) -> Result<(), Stranger> {
+        let Identity { farm: ours, incarnation } = self.identity;
+        let is_ours = farm.is_empty() || farm == ours.0;
+        self.admit(if is_ours { incarnation.0 } else { 0 })
+    }
+
+    pub(crate) fn join(&self, process: Process) -> Result<WorkerId, KeptOut> {
         self.tell(|state, now| state.farm.on_join(process, now))
     }
 
@@ -246,6 +408,11 @@ impl Shell {
         answer.await.expect("every question is answered")
     }
 
+    /// Offers tiles of a job whose pixels a worker has. It gets those that it may bring.
+    pub(crate) fn offer(&self, worker: WorkerId, job: JobId, tiles: &[u32]) -> Option<Run> {
+        self.tell(|state, now| (state.farm.on_offer(worker, job, tiles, now), Vec::new()))
+    }
+
     pub(crate) fn renew(
         &self,
         worker: WorkerId,
@@ -261,20 +428,23 @@ impl Shell {
         Some((tile, Arc::clone(state.jobs.get(&job)?)))
     }
 
-    /// Brings the pixels of a tile. The answer comes when they are safe. This writes a file: never
+    /// Brings the pixels of tiles. The verdicts come when all are safe. This writes a file: never
     /// call it on the async runtime.
-    pub(crate) fn deliver(
-        &self,
-        delivery: Delivery,
-        pixels: Vec<[f32; 3]>,
-    ) -> oneshot::Receiver<Verdict> {
-        let (reply, verdict) = oneshot::channel();
+    pub(crate) fn deliver(&self, tiles: Vec<(Delivery, Bytes)>) -> oneshot::Receiver<Vec<Verdict>> {
+        let (reply, verdicts) = oneshot::channel();
+        let (deliveries, pixels): (Vec<Delivery>, Vec<Bytes>) = tiles.into_iter().unzip();
+        let count = deliveries.len();
         self.tell(|state, now| {
-            let id = DeliveryId(state.next_number());
-            state.deliveries.insert(id, Undecided { pixels, reply });
-            ((), state.farm.on_pixels(id, delivery, now))
+            let first = state.last_number + 1;
+            state.last_number += count as u64;
+            let verdicts = vec![Verdict::Rejected; count];
+            let numbered = (first..).map(DeliveryId).zip(deliveries.clone());
+            let batch = Batch { deliveries, pixels, verdicts, undecided_count: count, reply };
+            state.batches.insert(DeliveryId(first), batch);
+            let arrived = |(id, delivery)| state.farm.on_pixels(id, delivery, now);
+            ((), numbered.flat_map(arrived).collect())
         });
-        verdict
+        verdicts
     }
 
     pub(crate) fn report_senseless_pixels(
@@ -297,37 +467,86 @@ impl Shell {
 
     /// Takes an order. This writes files: never call it on the async runtime.
     pub(crate) fn submit(&self, order: Order) -> Result<Arc<Job>, SubmitError> {
-        let Config { scene_folder, picture_folder, .. } = &self.config;
+        let id = self.state().farm.number_job();
+        let Some(folder) = &self.folder else {
+            let picture_folder = &self.config.picture_folder;
+            let canvas = Canvas::new_in(picture_folder, order.grid, order.format, order.transfer);
+            let canvas =
+                canvas.map_err(|error| SubmitError::Picture(picture_folder.clone(), error))?;
+            return self.submit_on(id, order, canvas, &[]);
+        };
+        let Order { name, prepared, settings, grid, transfer, format } = order;
+        let scene_byte_count = prepared.as_ref().len() as u64;
+        let plan =
+            Plan { scene: prepared.hash(), scene_byte_count, settings, grid, format, transfer };
+        let same = self.job_with_scene(plan.scene);
+        let same = same.as_ref().map(|job| job.scene.path());
+        let kept = folder.create_job(id, (name.clone(), &plan), &prepared, same);
+        let (scene, canvas, folder) = kept.map_err(SubmitError::State)?;
+        let job = Job::new(id, &plan, scene, canvas, Some(folder));
+        self.begin(&job, &name, Tiles::new(grid), Earlier::default());
+        Ok(job)
+    }
+
+    /// Gives a number to a job that [`Shell::submit_on`] takes.
+    pub(crate) fn number_job(&self) -> JobId {
+        self.state().farm.number_job()
+    }
+
+    /// Takes an order whose picture is `canvas`; these tiles are in it already. This writes files:
+    /// never call it on the async runtime.
+    pub(crate) fn submit_on(
+        &self,
+        id: JobId,
+        order: Order,
+        canvas: Canvas,
+        done: &[(TileId, TileRecord)],
+    ) -> Result<Arc<Job>, SubmitError> {
+        let scene_folder = &self.config.scene_folder;
         let Order { name, prepared, settings, grid, transfer, format } = order;
         let scene = SceneFile::write(scene_folder, &prepared)
             .map_err(|error| SubmitError::Scene(scene_folder.clone(), error))?;
         drop(prepared);
-        let picture = Picture::new_in(picture_folder, grid.window(), format, transfer)
-            .map_err(|error| SubmitError::Picture(picture_folder.clone(), error))?;
+        let (hash, scene_byte_count) = (scene.hash(), scene.byte_count());
+        let plan = Plan { scene: hash, scene_byte_count, settings, grid, format, transfer };
+        let job = Job::new(id, &plan, scene, canvas, None);
+        let (tiles, earlier) = progress_of(&plan, done);
+        self.begin(&job, &name, tiles, earlier);
+        Ok(job)
+    }
 
-        let id = self.state().farm.number_job();
+    fn begin(&self, job: &Arc<Job>, name: &str, tiles: Tiles, earlier: Earlier) {
         tracing::info!(
-            job = id.0,
+            job = job.id.0,
             scene = name,
-            size = %grid.window().size(),
-            sampling = %settings.quality.sampling,
-            ?transfer,
-            tiles = grid.count(),
-            side = grid.side(),
-            scene_bytes = scene.byte_count(),
+            size = %job.grid.window().size(),
+            sampling = %job.settings.quality.sampling,
+            transfer = ?job.canvas.picture().transfer(),
+            tiles = job.grid.count(),
+            side = job.grid.side(),
+            scene_bytes = job.scene.byte_count(),
+            done = (tiles.done_count() > 0).then_some(tiles.done_count()),
             "job started"
         );
-        let progress =
-            watch::Sender::new(Progress { tile_count: grid.count(), ..Progress::default() });
-        let hasher = TileHasher::new(id, scene.hash(), settings, grid);
-        let job = Arc::new(Job { id, scene, settings, grid, hasher, picture, progress });
-        // Not under the lock: there may be a million.
-        let tiles = Tiles::new(grid);
         self.tell(|state, now| {
-            state.jobs.insert(id, Arc::clone(&job));
-            ((), state.farm.on_submit(id, tiles, now))
+            state.jobs.insert(job.id, Arc::clone(job));
+            ((), state.farm.on_order(job.id, tiles, earlier, now))
         });
-        Ok(job)
+    }
+
+    /// Goes on with a job that an earlier coordinator left.
+    fn take_up(&self, kept: KeptJob) {
+        let KeptJob { id, name, plan, scene, canvas, done, end, folder } = kept;
+        let job = Job::new(id, &plan, scene, canvas, Some(folder));
+        if let Some(end) = end {
+            self.tell(|state, now| {
+                state.jobs.insert(id, job);
+                ((), state.farm.on_kept(id, end, now))
+            });
+        } else {
+            let (tiles, earlier) = progress_of(&plan, &done);
+            self.begin(&job, &name, tiles, earlier);
+        }
     }
 
     pub(crate) fn cancel(&self, job: JobId) {
@@ -353,7 +572,42 @@ impl Shell {
     }
 }
 
+/// A picture's tiles, of which some are done, and what was done so far.
+fn progress_of(plan: &Plan, done: &[(TileId, TileRecord)]) -> (Tiles, Earlier) {
+    // Not under the lock: there may be a million.
+    let (mut tiles, mut earlier) = (Tiles::new(plan.grid), Earlier::default());
+    for (tile, record) in done {
+        tiles.set_done(*tile, record.arrived);
+        earlier.tally.add(&record.tally);
+        let elapsed = Duration::try_from_secs_f32(record.elapsed).unwrap_or_default();
+        earlier.elapsed = earlier.elapsed.max(elapsed);
+        earlier.worker_count = earlier.worker_count.max(record.worker_count);
+    }
+    (tiles, earlier)
+}
+
 impl State {
+    /// The message that brought a tile, and which of its tiles that is.
+    fn batch(&mut self, delivery: DeliveryId) -> Option<(&mut Batch, usize)> {
+        let (first, batch) = self.batches.range_mut(..=delivery).next_back()?;
+        let index = (delivery.0 - first.0) as usize;
+        (index < batch.verdicts.len()).then_some((batch, index))
+    }
+
+    /// Answers a message when all of its tiles have a verdict.
+    fn acknowledge(&mut self, delivery: DeliveryId, verdict: Verdict) {
+        let Some((batch, index)) = self.batch(delivery) else { return };
+        batch.verdicts[index] = verdict;
+        batch.undecided_count -= 1;
+        let first = DeliveryId(delivery.0 - index as u64);
+        if batch.undecided_count == 0
+            && let Some(batch) = self.batches.remove(&first)
+        {
+            // The worker may have gone; another delivers its tiles again.
+            let _ = batch.reply.send(batch.verdicts);
+        }
+    }
+
     fn next_number(&mut self) -> u64 {
         self.last_number += 1;
         self.last_number
@@ -398,6 +652,11 @@ fn log(notice: Notice) {
             lease = loss.lease.id.0,
             "lease lost"
         ),
+        Notice::SetAside(job, tile) => tracing::error!(
+            job = job.0,
+            tile = tile.number(),
+            "a tile is set aside: too many workers were lost with it, or stood still"
+        ),
         Notice::TileDone { delivery, progress, elapsed } => {
             let Delivery { worker, tile, seconds, tally, .. } = delivery;
             let (worker, rays) = (Some(worker.0), tally.rays);
@@ -406,9 +665,30 @@ fn log(notice: Notice) {
         Notice::CopiesDiffer { second, first } => tracing::error!(
             worker = second.worker.0,
             tile = second.tile.number(),
-            first = %blake3::Hash::from_bytes(first),
+            other = first.worker.0,
+            first = %blake3::Hash::from_bytes(first.hash),
             second = %blake3::Hash::from_bytes(second.hash),
             "two copies of a tile differ; one of their workers is broken"
+        ),
+        Notice::Liar { worker, job, tile } => tracing::error!(
+            worker = worker.0,
+            job = job.0,
+            tile = tile.number(),
+            "a worker brought pixels that two others contradict; it is kept out from now on"
+        ),
+        Notice::TakenBack { worker, job, tiles } => tracing::warn!(
+            worker = worker.0,
+            job = job.0,
+            tiles = %list(&tiles),
+            "tiles of a worker that is kept out are rendered again"
+        ),
+        Notice::NoAudit => {
+            tracing::warn!("tiles are not compared: nobody is there to render them again");
+        }
+        Notice::NotCompared(job, tile) => tracing::warn!(
+            job = job.0,
+            tile = tile.number(),
+            "the tile is not compared: {MOST_LOSSES} workers that rendered it again were lost"
         ),
         Notice::JobFailed(job, reason) => tracing::warn!(job = job.0, reason, "job failed"),
         Notice::NotGranted { worker, lease, tile, count } => {

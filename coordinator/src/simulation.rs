@@ -1,7 +1,6 @@
-//! A farm of processes that die, stall, and deliver late, twice or never; of clients that cancel;
-//! of a coordinator that is killed
-//! and started anew; of a disk that takes its time and may fail: the real machine under a clock and a network of
-//! its own. A seed says all that happens.
+//! A farm of processes that die, stall, lie, and deliver late, twice or never; of clients that
+//! cancel; of a coordinator that is killed and started anew; of a disk that takes its time and may
+//! fail: the real machine under a clock and a network of its own. A seed says all that happens.
 
 use std::{
     collections::{BTreeMap, BTreeSet, VecDeque},
@@ -16,7 +15,8 @@ use rtfarm_job::Outcome;
 use rtfarm_proto::{Incarnation, JobId, LeaseId, LeaseName, Renewal, WorkerId};
 
 use crate::{
-    farm::{Action, Delivery, DeliveryId, Farm, Next, Notice, Verdict},
+    audit::Audit,
+    farm::{Action, Delivery, DeliveryId, Earlier, Farm, Next, Notice, Verdict},
     identity::Identity,
     members::Process,
     tiles::{PixelHash, Tiles},
@@ -64,10 +64,26 @@ fn identity(seed: u64, start: u32) -> Identity {
     Identity::from_random([(); 24].map(|()| random.below(256) as u8))
 }
 
+/// What compares all tiles in every other farm.
+fn audit(seed: u64) -> Audit {
+    Audit::new((seed % 2) as f64, [7; 32])
+}
+
+fn grid() -> TileGrid {
+    TileGrid::new(Size::new(7 * 16, 5 * 16).unwrap(), 16).unwrap()
+}
+
 /// What the pixels of a tile hash to in a job that shows `scene`.
 fn pixel_hash(scene: u8, tile: TileId) -> PixelHash {
     let mut hash = [scene; 32];
     hash[0] = tile.number() as u8;
+    hash
+}
+
+/// What a liar says of them: no two liars say the same.
+fn lie(liar: WorkerId, honest: PixelHash) -> PixelHash {
+    let mut hash = honest;
+    hash[28..].copy_from_slice(&(1 << 31 | liar.0).to_le_bytes());
     hash
 }
 
@@ -76,6 +92,9 @@ struct Renderer {
     worker: WorkerId,
     /// The start of the farm that it has joined.
     incarnation: Incarnation,
+    nonce: u64,
+    /// It lies of every third tile.
+    is_liar: bool,
     /// Tiles to be rendered, and what their scenes show.
     queue: VecDeque<(LeaseName, TileId, u8)>,
     /// Tiles that it has rendered: a counter that rises under every lease.
@@ -96,8 +115,8 @@ struct World {
     most_renderers: usize,
     /// Pixels under way: when they arrive, and which start of the farm they are meant for.
     post: Vec<(Instant, Incarnation, Delivery)>,
-    /// Pixels being written: when that is done.
-    disk: Vec<(Instant, JobId, TileId)>,
+    /// Pixels being written: when that is done, and which.
+    disk: Vec<(Instant, JobId, TileId, PixelHash)>,
     /// Questions without an answer, and until when they wait.
     asks: BTreeMap<AskId, Instant>,
     /// Who asked each question.
@@ -108,19 +127,31 @@ struct World {
     brought: BTreeMap<DeliveryId, PixelHash>,
     /// What clients ordered, and what each job shows: no two the same.
     jobs: BTreeMap<JobId, u8>,
+    /// The same of all jobs that there ever were.
+    shown: BTreeMap<JobId, u8>,
     /// Tiles of which pixels came that make no sense, and who brought the last.
     senseless: BTreeMap<(JobId, TileId), WorkerId>,
     nonsense_count: u32,
     /// Every tile that a worker was to render under a lease.
     granted: BTreeSet<(WorkerId, LeaseName, TileId)>,
     restart_count: u32,
+    /// Liars that have joined so far, and under which names.
+    liar_count: u64,
+    liars: BTreeSet<WorkerId>,
+    caught_count: u32,
+    /// Nobody was there to compare, at some time.
+    was_without_audit: bool,
+    /// Jobs that have tiles which were not compared.
+    not_compared: BTreeSet<JobId>,
     scene_count: u8,
     forgotten: BTreeSet<JobId>,
     outcomes: BTreeMap<JobId, Outcome>,
-    /// Tiles whose pixels were written, and how often.
-    picture: BTreeMap<(JobId, TileId), u32>,
+    /// Tiles whose pixels were written, unless they were taken back, and what was written.
+    picture: BTreeMap<(JobId, TileId), Vec<PixelHash>>,
     /// Tiles that the log calls finished.
     logged: BTreeSet<(JobId, TileId)>,
+    /// Tiles that were in work when too many workers were lost.
+    set_aside: BTreeSet<(JobId, TileId)>,
     has_stopped: bool,
 }
 
@@ -132,7 +163,7 @@ impl World {
             seed,
             random: SplitMix64(seed),
             now,
-            farm: Farm::new(identity(seed, 0), TERM),
+            farm: Farm::new(identity(seed, 0), TERM, audit(seed)),
             last_number: 0,
             renderers: Vec::new(),
             most_renderers: 1 + (seed % 5) as usize,
@@ -143,15 +174,22 @@ impl World {
             deliveries: BTreeMap::new(),
             brought: BTreeMap::new(),
             jobs: BTreeMap::new(),
+            shown: BTreeMap::new(),
             granted: BTreeSet::new(),
             senseless: BTreeMap::new(),
             nonsense_count: 0,
             restart_count: 0,
+            liar_count: 0,
+            liars: BTreeSet::new(),
+            caught_count: 0,
+            was_without_audit: false,
+            not_compared: BTreeSet::new(),
             scene_count: 0,
             forgotten: BTreeSet::new(),
             outcomes: BTreeMap::new(),
             picture: BTreeMap::new(),
             logged: BTreeSet::new(),
+            set_aside: BTreeSet::new(),
             has_stopped: false,
         }
     }
@@ -161,10 +199,18 @@ impl World {
         self.last_number
     }
 
-    fn join(&mut self) -> WorkerId {
-        let (nonce, threads) = (self.number(), 1 + self.random.below(3) as usize);
+    /// A process joins, unless it is kept out.
+    fn join(&mut self, nonce: u64, is_liar: bool) -> Option<WorkerId> {
+        let threads = 1 + self.random.below(3) as usize;
         let process = Process { nonce, number: nonce as u32, threads, ..Process::default() };
-        self.farm.on_join(process, self.now).0
+        let worker = self.farm.on_join(process, self.now).0;
+        assert!(is_liar || worker.is_ok(), "an honest worker is kept out");
+        if let Ok(worker) = worker
+            && is_liar
+        {
+            self.liars.insert(worker);
+        }
+        worker.ok()
     }
 
     /// Does what the machine says, as the shell does.
@@ -196,10 +242,11 @@ impl World {
                 }
                 Action::Store(delivery, job, tile) => {
                     assert_eq!(self.deliveries[&delivery], (job, tile));
-                    let shown = self.brought[&delivery];
-                    assert_eq!(shown, pixel_hash(self.jobs[&job], tile), "of another picture");
+                    let (shown, honest) =
+                        (self.brought[&delivery], pixel_hash(self.jobs[&job], tile));
+                    assert_eq!(shown[..28], honest[..28], "of another picture");
                     let end = self.now + self.random.milliseconds_below(500);
-                    self.disk.push((end, job, tile));
+                    self.disk.push((end, job, tile, shown));
                 }
                 Action::Acknowledge(delivery, verdict) => {
                     let tile = self.deliveries.remove(&delivery);
@@ -211,11 +258,34 @@ impl World {
                     assert!(!self.outcomes.contains_key(&job), "job {job} has ended");
                     self.outcomes.extend(progress.outcome.map(|outcome| (job, outcome)));
                 }
+                Action::TakeBack(job, tiles) => {
+                    for tile in tiles {
+                        assert!(self.picture.remove(&(job, tile)).is_some());
+                    }
+                }
                 Action::Forget(job) => assert!(self.forgotten.insert(job)),
                 Action::Log(Notice::TileDone { delivery, .. }) => {
                     assert!(self.logged.insert((delivery.lease.job, delivery.tile)));
                 }
-                Action::Log(Notice::CopiesDiffer { .. }) => panic!("tiles are deterministic"),
+                Action::Log(Notice::SetAside(job, tile)) => {
+                    self.set_aside.insert((job, tile));
+                }
+                Action::Log(Notice::CopiesDiffer { second, first }) => {
+                    let is_lie = |worker| self.liars.contains(&worker);
+                    assert!(is_lie(second.worker) || is_lie(first.worker), "who is honest agrees");
+                }
+                Action::Log(Notice::Liar { worker, .. }) => {
+                    assert!(self.liars.contains(&worker), "worker {worker} is honest");
+                    self.caught_count += 1;
+                }
+                Action::Log(Notice::TakenBack { worker, job, tiles }) => {
+                    assert!(self.liars.contains(&worker));
+                    assert!(tiles.iter().all(|&tile| self.logged.remove(&(job, tile))));
+                }
+                Action::Log(Notice::NoAudit) => self.was_without_audit = true,
+                Action::Log(Notice::NotCompared(job, _)) => {
+                    self.not_compared.insert(job);
+                }
                 Action::Log(_) => {}
                 Action::Stop => self.has_stopped = true,
             }
@@ -234,11 +304,11 @@ impl World {
 
         let now = self.now;
         let written: Vec<_> = self.disk.extract_if(.., |(end, ..)| *end <= now).collect();
-        for (_, job, tile) in written {
+        for (_, job, tile, shown) in written {
             let actions = if self.random.one_in(1000) {
                 self.farm.on_store_failed(job, "the disk is full".to_owned())
             } else {
-                *self.picture.entry((job, tile)).or_default() += 1;
+                self.picture.entry((job, tile)).or_default().push(shown);
                 self.farm.on_stored(job, tile, now)
             };
             self.act(actions);
@@ -292,11 +362,11 @@ impl World {
     /// Clients order pictures of 7 x 5 tiles, and may change their minds.
     fn submit_or_cancel(&mut self) {
         if self.jobs.len() < JOBS && (self.jobs.is_empty() || self.random.one_in(50)) {
-            let grid = TileGrid::new(Size::new(7 * 16, 5 * 16).unwrap(), 16).unwrap();
             let job = self.farm.number_job();
             self.scene_count += 1;
             assert_eq!(self.jobs.insert(job, self.scene_count), None, "a number is given twice");
-            let actions = self.farm.on_submit(job, Tiles::new(grid), self.now);
+            self.shown.insert(job, self.scene_count);
+            let actions = self.farm.on_submit(job, Tiles::new(grid()), self.now);
             self.act(actions);
         }
         if self.random.one_in(400) {
@@ -318,35 +388,62 @@ impl World {
         admitted.is_ok()
     }
 
-    /// The coordinator is killed and started anew: connections break, pictures are gone, workers
-    /// and their pixels are not.
+    /// The coordinator is killed and started anew: connections break, workers and their pixels stay. It
+    /// may have kept jobs and pictures, or they are gone.
     fn restart(&mut self) {
         self.restart_count += 1;
-        self.farm = Farm::new(identity(self.seed, self.restart_count), TERM);
+        let identity = identity(self.seed, self.restart_count);
+        let keeps_jobs = self.random.one_in(2) && !self.jobs.is_empty();
+        self.farm = match self.shown.keys().last() {
+            Some(&last) if keeps_jobs => Farm::keeping_jobs(identity, TERM, audit(self.seed), last),
+            _ => Farm::new(identity, TERM, audit(self.seed)),
+        };
+        self.liars.clear();
         self.asks.clear();
         self.deliveries.clear();
         self.disk.clear();
         for renderer in &mut self.renderers {
             renderer.ask = None;
         }
-        self.forgotten.extend(self.jobs.keys());
-        let outcomes = &self.outcomes;
-        self.jobs.retain(|job, _| outcomes.contains_key(job));
+        if !keeps_jobs {
+            self.forgotten.extend(self.jobs.keys());
+            let outcomes = &self.outcomes;
+            self.jobs.retain(|job, _| outcomes.contains_key(job));
+        }
+        // What an earlier start took is not compared any more.
+        self.not_compared.extend(self.jobs.keys());
+        for id in self.jobs.keys().copied().collect::<Vec<JobId>>() {
+            if self.outcomes.contains_key(&id) {
+                self.forgotten.insert(id);
+                continue;
+            }
+            let mut tiles = Tiles::new(grid());
+            for (&(_, tile), written) in self.picture.iter().filter(|((job, _), _)| *job == id) {
+                tiles.set_done(tile, written[0]);
+            }
+            self.set_aside.retain(|(job, _)| *job != id);
+            let actions = self.farm.on_order(id, tiles, Earlier::default(), self.now);
+            self.act(actions);
+        }
     }
 
     /// One process dies, stalls or works.
     fn work(&mut self) {
         if self.renderers.len() < self.most_renderers {
-            let (worker, stopped_until) = (self.join(), self.now);
-            let queue = VecDeque::new();
-            let incarnation = self.farm.incarnation();
+            let nonce = self.number();
+            // Most are honest.
+            let is_liar = self.most_renderers > 3 && self.liar_count * 3 < nonce.isqrt();
+            self.liar_count += u64::from(is_liar);
+            let worker = self.join(nonce, is_liar).expect("it is new");
             self.renderers.push(Renderer {
                 worker,
-                incarnation,
-                queue,
+                incarnation: self.farm.incarnation(),
+                nonce,
+                is_liar,
+                queue: VecDeque::new(),
                 work: 0,
                 ask: None,
-                stopped_until,
+                stopped_until: self.now,
             });
         }
         let index = self.random.below(self.renderers.len() as u64) as usize;
@@ -363,9 +460,12 @@ impl World {
             return;
         }
         if renderer.worker == WorkerId(0) {
-            let (worker, incarnation) = (self.join(), self.farm.incarnation());
+            let Renderer { nonce, is_liar, .. } = *renderer;
+            let Some(worker) = self.join(nonce, is_liar) else {
+                return drop(self.renderers.swap_remove(index));
+            };
             let renderer = &mut self.renderers[index];
-            (renderer.worker, renderer.incarnation) = (worker, incarnation);
+            (renderer.worker, renderer.incarnation) = (worker, self.farm.incarnation());
         } else if let Some((lease, tile, scene)) = renderer.queue.pop_front() {
             self.render(index, lease, tile, scene);
         } else {
@@ -401,9 +501,11 @@ impl World {
     }
 
     fn render(&mut self, index: usize, lease: LeaseName, tile: TileId, scene: u8) {
-        let Renderer { worker, incarnation, .. } = self.renderers[index];
+        let Renderer { worker, incarnation, is_liar, .. } = self.renderers[index];
         let tally = Tally::default();
-        let hash = pixel_hash(scene, tile);
+        let honest = pixel_hash(scene, tile);
+        let hash =
+            if is_liar && tile.number().is_multiple_of(3) { lie(worker, honest) } else { honest };
         let delivery = Delivery { worker, lease, tile, hash, seconds: 0.1, tally };
         if self.random.one_in(200) {
             self.bring_nonsense(worker, incarnation, lease, tile);
@@ -427,9 +529,9 @@ impl World {
         *work += 1;
         let renewals: Vec<Renewal> = queue
             .iter()
-            .map(|&(other, ..)| Renewal {
-                lease: other,
-                work: if other == lease { *work } else { 0 },
+            .map(|&(other, next, _)| {
+                let tiles = if other == lease { vec![(next.number(), *work)] } else { Vec::new() };
+                Renewal { lease: other, work: 0, tiles }
             })
             .collect();
         if let Ok(lost) = self.farm.on_renew(*worker, &renewals, self.now) {
@@ -454,7 +556,7 @@ impl World {
         }
         let actions = self.farm.on_senseless_pixels(worker, lease, tile, "it is NaN", self.now);
         let ends = actions.iter().any(|action| match action {
-            Action::Publish(_, progress) => progress.outcome.is_some(),
+            Action::Log(Notice::JobFailed(_, reason)) => reason.contains("it is NaN"),
             _ => false,
         });
         let earlier = self.senseless.insert((lease.job, tile), worker);
@@ -506,13 +608,16 @@ impl Drop for World {
 #[test]
 fn every_job_ends_and_every_tile_is_stitched_once_though_everything_goes_wrong() {
     let [mut finished, mut failed, mut cancelled, mut restarts, mut nonsense] = [0; 5];
+    let [mut caught, mut set_aside, mut compared] = [0; 3];
     for seed in 0..SEEDS {
         let mut world = World::new(seed);
         world.run();
         world.shut_down();
         restarts += world.restart_count;
         nonsense += world.nonsense_count;
-        assert!(world.picture.values().all(|&count| count == 1));
+        caught += world.caught_count;
+        set_aside += world.set_aside.len() as u32;
+        assert!(world.picture.values().all(|written| written.len() == 1));
         for (job, outcome) in &world.outcomes {
             let stored = world.picture.keys().filter(|(stored, _)| stored == job).count();
             let logged = world.logged.iter().filter(|(logged, _)| logged == job).count();
@@ -520,14 +625,24 @@ fn every_job_ends_and_every_tile_is_stitched_once_though_everything_goes_wrong()
                 Outcome::Finished(_) => {
                     assert_eq!((stored, logged), (TILES, TILES));
                     finished += 1;
+                    let was_compared =
+                        !world.was_without_audit && !world.not_compared.contains(job);
+                    if seed % 2 == 1 && was_compared {
+                        let of_job = world.picture.iter().filter(|((of, _), _)| of == job);
+                        for ((_, tile), written) in of_job {
+                            assert_eq!(written[0], pixel_hash(world.shown[job], *tile));
+                        }
+                        compared += 1;
+                    }
                 }
                 Outcome::Failed(reason) => {
-                    assert!(logged < TILES && logged <= stored);
+                    assert!(logged <= stored);
                     *(if reason == "it was cancelled" { &mut cancelled } else { &mut failed }) += 1;
                 }
             }
         }
     }
-    let ends = [finished, failed, cancelled, restarts, nonsense];
+    let ends = [finished, failed, cancelled, restarts, nonsense, caught, set_aside, compared];
+    eprintln!("{ends:?}");
     assert!(ends.iter().all(|&count| count > 20), "each end is met: {ends:?}");
 }

@@ -9,7 +9,7 @@ use rtfarm_core::{
     tile::{Size, TileGrid},
 };
 use rtfarm_proto::{
-    Address, JobId, LeaseName, PROTOCOL, TileHasher, pixels_to_bytes, scene_hash,
+    Address, Bytes, JobId, LeaseName, PROTOCOL, TileHasher, pixels_to_bytes, scene_hash,
     wire::{
         self, event::End, farm_client::FarmClient, jobs_client::JobsClient, lease_response::Next,
         submit_request::Part, submit_response::Outcome,
@@ -24,6 +24,8 @@ const SCENE: &str = "viewport\norigin 0 0 -2\ntopleft -1 1 0\nbottomleft -1 -1 0
     background 10 20 30\nendviewport\n";
 
 const VERSION: &str = "1.2.3";
+const BUILD: &str = "a1b2";
+const REFERENCE: [u8; 32] = [0xab; 32];
 
 /// A farm with one worker, played by the test, and one job of 2 x 1 tiles of 8 x 8 pixels.
 struct Farm {
@@ -33,6 +35,8 @@ struct Farm {
     jobs: JobsClient<Channel>,
     worker: u32,
     incarnation: u64,
+    /// The id that clients name.
+    named: Bytes,
     job: u64,
     scene: SceneHash,
     settings: Settings,
@@ -46,7 +50,10 @@ impl Farm {
             format!("http://{}", listener.local_addr().unwrap()).parse().unwrap();
         let coordinator = Coordinator::new(Config {
             version: VERSION.to_owned(),
+            build: BUILD.to_owned(),
+            reference: Some(REFERENCE),
             term: Duration::from_millis(300),
+            audit: 0.0,
             upload_silence: Duration::from_millis(600),
             scene_folder: folder.path().to_owned(),
             picture_folder: folder.path().to_owned(),
@@ -63,8 +70,7 @@ impl Farm {
             .map(|part| wire::SubmitRequest { part: Some(part) });
         let answer = jobs.submit(tokio_stream::iter(parts)).await.unwrap().into_inner();
         let Some(Outcome::Accepted(accepted)) = answer.outcome else { panic!("{answer:?}") };
-        assert_eq!((accepted.tile_count, accepted.incarnation), (2, incarnation));
-        assert_eq!(accepted.farm, joined.farm);
+        assert_eq!((accepted.tile_count, &accepted.farm), (2, &joined.farm));
         Self {
             _folder: folder,
             address,
@@ -72,6 +78,7 @@ impl Farm {
             jobs,
             worker,
             incarnation,
+            named: accepted.farm,
             job: accepted.job,
             scene: SceneHash([0; 32]),
             settings: Settings { size: Size::new(16, 8).unwrap(), quality: Quality::default() },
@@ -84,6 +91,7 @@ impl Farm {
             max_tiles: 64,
             wait_ms: 5000,
             incarnation: self.incarnation,
+            kept: None,
         };
         match self.tiles.lease(request).await.unwrap().into_inner().next {
             Some(Next::Run(run)) => {
@@ -102,7 +110,7 @@ impl Farm {
         tile: u32,
         value: f32,
     ) -> Result<wire::Verdict, Code> {
-        let pixels = pixels_to_bytes(&[[value; 3]; 64]);
+        let pixels = pixels_to_bytes(vec![[value; 3]; 64]);
         let hash = self.hash(tile, &pixels);
         self.send(lease, tile, pixels.to_vec(), hash).await
     }
@@ -122,26 +130,44 @@ impl Farm {
         pixels: Vec<u8>,
         hash: Vec<u8>,
     ) -> Result<wire::Verdict, Code> {
-        let delivery = wire::DeliverRequest {
-            worker: self.worker,
-            incarnation: self.incarnation,
-            lease: Some(lease.into()),
-            tile,
-            pixels: pixels.into(),
-            hash: hash.into(),
-            seconds: 0.1,
-            tally: Some(wire::Tally { rays: 64, ..wire::Tally::default() }),
-        };
+        let finished = finished(lease, tile, pixels, hash);
+        self.send_all(vec![finished]).await.map(|verdicts| verdicts[0])
+    }
+
+    async fn send_all(
+        &mut self,
+        tiles: Vec<wire::FinishedTile>,
+    ) -> Result<Vec<wire::Verdict>, Code> {
+        let (worker, incarnation) = (self.worker, self.incarnation);
+        let delivery = wire::DeliverRequest { worker, incarnation, tiles };
         let answer = self.tiles.deliver(delivery).await;
-        answer.map(|answer| answer.into_inner().verdict()).map_err(|status| status.code())
+        answer
+            .map(|answer| answer.into_inner().verdicts().collect())
+            .map_err(|status| status.code())
     }
 
     /// The state of the job now.
     async fn state(&mut self) -> wire::Event {
-        let request = wire::WatchRequest { job: self.job, incarnation: self.incarnation };
+        let request = wire::WatchRequest { job: self.job, farm: self.named.clone() };
         let mut events = self.jobs.watch(request).await.unwrap().into_inner();
         events.message().await.unwrap().unwrap()
     }
+}
+
+fn finished(lease: LeaseName, tile: u32, pixels: Vec<u8>, hash: Vec<u8>) -> wire::FinishedTile {
+    wire::FinishedTile {
+        lease: Some(lease.into()),
+        tile,
+        pixels: pixels.into(),
+        hash: hash.into(),
+        seconds: 0.1,
+        tally: Some(wire::Tally { rays: 64, ..wire::Tally::default() }),
+    }
+}
+
+/// A question of a worker for a tile, which waits for nothing.
+fn lease_of(worker: u32, incarnation: u64) -> wire::LeaseRequest {
+    wire::LeaseRequest { worker, max_tiles: 1, wait_ms: 0, incarnation, kept: None }
 }
 
 fn order(version: &str) -> wire::Order {
@@ -166,8 +192,34 @@ fn join(version: &str) -> wire::JoinRequest {
         protocol: PROTOCOL,
         nonce: 1,
         threads: 1,
+        isa: "avx2".to_owned(),
+        build: BUILD.to_owned(),
+        reference: REFERENCE.to_vec().into(),
         ..wire::JoinRequest::default()
     }
+}
+
+#[tokio::test]
+async fn a_worker_that_would_make_other_pixels_is_refused_and_told_why() {
+    let mut farm = Farm::new().await;
+    let refusals = [
+        (join("1.2.4"), "rtfarm 1.2.4"),
+        (
+            wire::JoinRequest { build: "c3d4".to_owned(), ..join(VERSION) },
+            "built from other sources (build `c3d4`) than the coordinator (build `a1b2`)",
+        ),
+        (
+            wire::JoinRequest { reference: vec![0xcd; 32].into(), ..join(VERSION) },
+            "with avx2, makes other pixels of the reference tile",
+        ),
+        (wire::JoinRequest { reference: vec![].into(), ..join(VERSION) }, "reference tile"),
+    ];
+    for (request, reason) in refusals {
+        let status = farm.tiles.join(request).await.unwrap_err();
+        assert_eq!(status.code(), Code::FailedPrecondition);
+        assert!(status.message().contains(reason), "{}", status.message());
+    }
+    farm.tiles.join(join(VERSION)).await.unwrap();
 }
 
 #[tokio::test]
@@ -195,13 +247,33 @@ async fn a_lease_without_progress_is_given_again_and_late_pixels_count() {
     };
     let renewal = wire::RenewRequest {
         worker: farm.worker,
-        renewals: vec![wire::Renewal { lease: Some(late.into()), work: 1 }],
+        renewals: vec![wire::Renewal { lease: Some(late.into()), work: 1, tiles: vec![] }],
         incarnation: farm.incarnation,
     };
     let lost = farm.tiles.renew(renewal).await.unwrap().into_inner().lost;
     assert_eq!(lost, [late.into()]);
     assert_eq!(farm.deliver(late, tiles[0], 0.5).await, Ok(wire::Verdict::Accepted));
     assert_eq!(farm.deliver(second, again[0], 0.5).await, Ok(wire::Verdict::Duplicate));
+}
+
+#[tokio::test]
+async fn tiles_of_one_message_are_decided_one_by_one() {
+    let mut farm = Farm::new().await;
+    let (lease, tiles) = farm.lease().await;
+    let bytes = vec![0; 64 * 12];
+    let good = finished(lease, tiles[0], bytes.clone(), farm.hash(tiles[0], &bytes));
+    let unknown = finished(lease, 99, bytes.clone(), farm.hash(99, &bytes));
+    let damaged = finished(lease, tiles[0], bytes, vec![7; 32]);
+    let verdicts = farm.send_all(vec![good.clone(), damaged]).await;
+    assert_eq!(verdicts, Err(Code::DataLoss), "the message is sent again");
+    assert_eq!(farm.state().await.tiles_done, 0);
+    let verdicts = farm.send_all(vec![unknown, good.clone(), good.clone()]).await;
+    let [rejected, accepted, duplicate] =
+        [wire::Verdict::Rejected, wire::Verdict::Accepted, wire::Verdict::Duplicate];
+    assert_eq!(verdicts, Ok(vec![rejected, accepted, duplicate]));
+    assert_eq!(farm.send_all(vec![good]).await, Ok(vec![duplicate]));
+    assert_eq!(farm.send_all(vec![]).await, Ok(vec![]));
+    assert_eq!(farm.state().await.tiles_done, 1);
 }
 
 #[tokio::test]
@@ -213,12 +285,12 @@ async fn damaged_and_senseless_pixels_are_refused() {
     assert_eq!(farm.send(lease, tiles[0], bytes.clone(), vec![0; 32]).await, Err(Code::DataLoss));
     let short = vec![0; 13];
     let short_hash = farm.hash(tiles[0], &short);
-    assert_eq!(farm.send(lease, tiles[0], short, short_hash).await, Err(Code::InvalidArgument));
     let other_tile = farm.hash(1 - tiles[0], &bytes);
     assert_eq!(farm.send(lease, tiles[0], bytes.clone(), other_tile).await, Err(Code::DataLoss));
     let plain = blake3::hash(&bytes).as_bytes().to_vec();
     assert_eq!(farm.send(lease, tiles[0], bytes.clone(), plain).await, Err(Code::DataLoss));
     let rejected = Ok(wire::Verdict::Rejected);
+    assert_eq!(farm.send(lease, tiles[0], short, short_hash).await, rejected);
     assert_eq!(farm.send(lease, 99, vec![0; 64 * 12], hash).await, rejected);
     assert_eq!(farm.state().await.tiles_done, 0);
 
@@ -237,13 +309,13 @@ async fn strangers_are_told_what_is_wrong() {
     assert_eq!(status.code(), Code::FailedPrecondition);
     assert!(status.message().contains("rtfarm 1.2.4") && status.message().contains(VERSION));
     let incarnation = farm.incarnation;
-    let request = wire::LeaseRequest { worker: 77, max_tiles: 1, wait_ms: 0, incarnation };
+    let request = lease_of(77, incarnation);
     assert_eq!(farm.tiles.lease(request).await.unwrap_err().code(), Code::NotFound);
     let request = wire::FetchRequest { scene_hash: vec![1; 32].into(), incarnation };
     assert_eq!(farm.tiles.fetch(request).await.unwrap_err().code(), Code::NotFound);
-    let request = wire::WatchRequest { job: 77, incarnation };
+    let request = wire::WatchRequest { job: 77, farm: farm.named.clone() };
     assert_eq!(farm.jobs.watch(request).await.unwrap_err().code(), Code::NotFound);
-    let request = wire::ImageRequest { job: farm.job, incarnation };
+    let request = wire::ImageRequest { job: farm.job, farm: farm.named.clone() };
     assert_eq!(farm.jobs.image(request).await.unwrap_err().code(), Code::FailedPrecondition);
 }
 
@@ -293,6 +365,7 @@ async fn a_client_that_goes_while_its_scene_is_prepared_leaves_no_job() {
         incarnation: farm.incarnation,
         max_tiles: 64,
         wait_ms: 5000,
+        kept: None,
     };
     let next = farm.tiles.lease(request).await.unwrap().into_inner().next;
     assert!(matches!(next, Some(Next::Nothing(_))), "{next:?}");
@@ -370,18 +443,19 @@ async fn calls_meant_for_another_start_of_the_coordinator_are_refused() {
     let mut farm = Farm::new().await;
     let (lease, tiles) = farm.lease().await;
     let (worker, job, incarnation) = (farm.worker, farm.job, farm.incarnation ^ 1);
-    let request = wire::LeaseRequest { worker, incarnation, max_tiles: 1, wait_ms: 0 };
+    let request = lease_of(worker, incarnation);
     let status = farm.tiles.lease(request).await.unwrap_err();
     assert_eq!(status.code(), Code::NotFound);
     assert!(status.message().contains("not meant for this start"), "{status}");
-    let renewals = vec![wire::Renewal { lease: Some(lease.into()), work: 1 }];
+    let renewals = vec![wire::Renewal { lease: Some(lease.into()), work: 1, tiles: vec![] }];
     let request = wire::RenewRequest { worker, incarnation, renewals };
     assert_eq!(farm.tiles.renew(request).await.unwrap_err().code(), Code::NotFound);
     let request = wire::LeaveRequest { worker, incarnation, reason: String::new() };
     assert_eq!(farm.tiles.leave(request).await.unwrap_err().code(), Code::NotFound);
-    let request = wire::WatchRequest { job, incarnation };
+    let another: Bytes = farm.named.iter().map(|byte| byte ^ 1).collect();
+    let request = wire::WatchRequest { job, farm: another.clone() };
     assert_eq!(farm.jobs.watch(request).await.unwrap_err().code(), Code::NotFound);
-    let request = wire::CancelRequest { job, incarnation };
+    let request = wire::CancelRequest { job, farm: another };
     assert_eq!(farm.jobs.cancel(request).await.unwrap_err().code(), Code::NotFound);
     farm.incarnation ^= 1;
     assert_eq!(farm.deliver(lease, tiles[0], 0.5).await, Err(Code::NotFound));

@@ -17,6 +17,8 @@ pub struct Progress {
     pub worker_count: u32,
     /// Tiles of which two copies differed.
     pub differing_tiles: u32,
+    /// Tiles that were taken out of the picture again, since their worker was found to lie.
+    pub taken_back: u32,
     /// How it ended, once it has.
     pub outcome: Option<Outcome>,
 }

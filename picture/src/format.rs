@@ -2,6 +2,8 @@
 
 use rtfarm_core::transfer::Transfer;
 
+use crate::picture::{PIXEL_BYTES, channels};
+
 /// How a picture is written. All light is on channels where 1.0 stands for 255 in a scene.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum PictureFormat {
@@ -23,19 +25,22 @@ impl PictureFormat {
         }
     }
 
-    /// Appends a pixel as the picture's file holds it.
-    pub(crate) fn append(self, bytes: &mut Vec<u8>, pixel: [f32; 3], transfer: Transfer) {
-        for channel in pixel {
+    /// Pixels, which come as little-endian f32, as the picture's file holds them.
+    pub(crate) fn encode(self, pixels: &[u8], transfer: Transfer) -> Vec<u8> {
+        let (pixels, _) = pixels.as_chunks::<PIXEL_BYTES>();
+        let mut bytes = Vec::with_capacity(pixels.len() * self.bytes_per_pixel());
+        for light in pixels.iter().flat_map(channels) {
             match self {
-                Self::Png8 => bytes.push(quantize(channel, transfer, 255.0) as u8),
+                Self::Png8 => bytes.push(quantize(light, transfer, 255.0) as u8),
                 // PNG has the high byte first.
                 Self::Png16 => {
-                    let step = quantize(channel, transfer, 65_535.0) as u16;
+                    let step = quantize(light, transfer, 65_535.0) as u16;
                     bytes.extend(step.to_be_bytes());
                 }
-                Self::ExrF32 => bytes.extend(channel.to_ne_bytes()),
+                Self::ExrF32 => bytes.extend(light.to_ne_bytes()),
             }
         }
+        bytes
     }
 }
 

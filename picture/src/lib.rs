@@ -1,10 +1,15 @@
 //! A picture in a file: tiles are put into it in any order and from any thread, then it is encoded
-//! as a PNG or an `OpenEXR`, band by band, so that its size is not limited by memory.
+//! as a PNG or an `OpenEXR`, band by band, so that its size is not limited by memory. A [`Canvas`] may
+//! outlive its process, and says then which tiles are in it.
 
+mod canvas;
+mod disk;
 mod exr;
 mod format;
 mod picture;
 mod png;
 
+pub use canvas::{Canvas, CanvasTile, TileRecord};
+pub use disk::Disk;
 pub use format::PictureFormat;
-pub use picture::{Picture, PutError, check_pixels};
+pub use picture::{Picture, PutError, TilePixels, pixel_bytes};

@@ -17,17 +17,17 @@ use rustix::{
     io::Errno,
 };
 
-use crate::{PictureFormat, exr, png};
+use crate::{Disk, PictureFormat, exr, png};
 
 /// Why a tile cannot be put into a picture.
 #[derive(Debug, thiserror::Error)]
 pub enum PutError {
-    /// The tile has another number of pixels than its area.
-    #[error("a tile of {expected} pixels came with {found}")]
-    PixelCount {
-        /// Pixels in the area.
+    /// The pixels do not fill the tile's area.
+    #[error("a tile of {expected} bytes came with {found}")]
+    ByteCount {
+        /// Bytes that the area's pixels take.
         expected: usize,
-        /// Pixels that came.
+        /// Bytes that came.
         found: usize,
     },
     /// A channel of this pixel is not a number.
@@ -43,6 +43,18 @@ pub enum PutError {
     Io(#[from] io::Error),
 }
 
+/// A finished tile, as it travels and as it is put into a picture.
+#[derive(Debug, Clone, Copy)]
+pub struct TilePixels<'a> {
+    /// Where it stands.
+    pub area: Area,
+    /// Red, green, blue as little-endian f32, `[y][x]` row by row.
+    pub bytes: &'a [u8],
+}
+
+/// Bytes of a pixel in [`TilePixels`].
+pub(crate) const PIXEL_BYTES: usize = 12;
+
 /// A picture in a file, row by row from the top left. Tiles may be put from several threads; the
 /// picture itself takes no memory.
 #[derive(Debug)]
@@ -51,6 +63,7 @@ pub struct Picture {
     window: Area,
     format: PictureFormat,
     transfer: Transfer,
+    disk: Disk,
 }
 
 impl Picture {
@@ -64,7 +77,18 @@ impl Picture {
     ) -> io::Result<Self> {
         let window = window.into();
         file.set_len(Self::byte_count(window.size(), format))?;
-        Ok(Self { file, window, format, transfer })
+        Ok(Self::with(file, window, format, transfer, Disk::default()))
+    }
+
+    /// Takes a file that has the length of such a picture.
+    pub(crate) fn with(
+        file: File,
+        window: Area,
+        format: PictureFormat,
+        transfer: Transfer,
+        disk: Disk,
+    ) -> Self {
+        Self { file, window, format, transfer, disk }
     }
 
     /// Makes a black picture in a file of `folder` that has no name, so that nothing stays behind
@@ -77,14 +101,7 @@ impl Picture {
     ) -> io::Result<Self> {
         let file = tempfile::tempfile_in(folder)?;
         let window = window.into();
-        let byte_count = Self::byte_count(window.size(), format);
-        loop {
-            match fallocate(&file, FallocateFlags::empty(), 0, byte_count) {
-                Ok(()) | Err(Errno::OPNOTSUPP) => break,
-                Err(Errno::INTR) => {}
-                Err(error) => return Err(error.into()),
-            }
-        }
+        reserve(&file, Self::byte_count(window.size(), format))?;
         Self::new(file, window, format, transfer)
     }
 
@@ -104,24 +121,67 @@ impl Picture {
     }
 
     /// The curve by which a PNG is encoded.
-    pub(crate) fn transfer(&self) -> Transfer {
+    pub fn transfer(&self) -> Transfer {
         self.transfer
     }
 
     /// Writes the pixels of `area`, `[y][x]` row by row. The picture's window must have them all.
     pub fn put(&self, area: Area, pixels: &[[f32; 3]]) -> Result<(), PutError> {
-        assert!(self.window.has(area), "the area is one of the picture's");
-        check_pixels(area, pixels)?;
-        let mut bytes = Vec::with_capacity(area.width() as usize * self.format.bytes_per_pixel());
-        for (y, row) in area.rows().zip(pixels.chunks_exact(area.width() as usize)) {
+        self.put_all(&[TilePixels { area, bytes: pixel_bytes(pixels) }])
+    }
+
+    /// Writes tiles, all of which the picture's window must have. Those that stand side by side are
+    /// written together, a row at a time, or all rows at once when they are as wide as the picture.
+    pub fn put_all(&self, tiles: &[TilePixels<'_>]) -> Result<(), PutError> {
+        let encoded = tiles.iter().map(|tile| Ok((tile.area, self.encode_tile(tile)?)));
+        Ok(self.write(encoded.collect::<Result<_, PutError>>()?)?)
+    }
+
+    /// The bytes of a tile, row by row, as the picture's file holds them.
+    pub(crate) fn encode_tile(&self, tile: &TilePixels<'_>) -> Result<Vec<u8>, PutError> {
+        assert!(self.window.has(tile.area), "the area is one of the picture's");
+        tile.check()?;
+        Ok(self.format.encode(tile.bytes, self.transfer))
+    }
+
+    /// Writes tiles as the picture's file holds them.
+    pub(crate) fn write(&self, mut tiles: Vec<(Area, Vec<u8>)>) -> io::Result<()> {
+        tiles.sort_unstable_by_key(|(area, _)| (area.rows().start, area.x0()));
+        let is_beside = |(left, _): &(Area, _), (right, _): &(Area, _)| {
+            left.rows() == right.rows() && left.columns().end == right.x0()
+        };
+        let mut bytes = Vec::new();
+        for side_by_side in tiles.chunk_by(is_beside) {
+            let (x0, rows) = (side_by_side[0].0.x0(), side_by_side[0].0.rows());
             bytes.clear();
-            for &pixel in row {
-                self.format.append(&mut bytes, pixel, self.transfer);
+            for y in 0..rows.len() {
+                for (_, tile) in side_by_side {
+                    let row_bytes = tile.len() / rows.len();
+                    bytes.extend_from_slice(&tile[y * row_bytes..][..row_bytes]);
+                }
             }
-            let offset = self.offset(area.x0() - self.window.x0(), y - self.window.y0());
-            self.file.write_all_at(&bytes, offset)?;
+            let row_bytes = bytes.len() / rows.len();
+            let at_once = if row_bytes == self.row_bytes() { bytes.len() } else { row_bytes };
+            for (y, run) in rows.zip(bytes.chunks_exact(at_once)) {
+                self.disk.write_at(&self.file, run, self.offset_in_frame(x0, y))?;
+            }
         }
         Ok(())
+    }
+
+    /// The bytes of `area`, row by row.
+    pub(crate) fn read_area(&self, area: Area) -> io::Result<Vec<u8>> {
+        let mut bytes = vec![0; area.pixel_count() * self.format.bytes_per_pixel()];
+        let row_bytes = area.width() as usize * self.format.bytes_per_pixel();
+        for (y, row) in area.rows().zip(bytes.chunks_exact_mut(row_bytes)) {
+            self.file.read_exact_at(row, self.offset_in_frame(area.x0(), y))?;
+        }
+        Ok(bytes)
+    }
+
+    /// Makes what was written outlive a power cut.
+    pub(crate) fn sync(&self) -> io::Result<()> {
+        self.file.sync_data()
     }
 
     /// Writes the whole picture as a file of its format. The same picture gives the same bytes.
@@ -146,24 +206,60 @@ impl Picture {
         self.window.width() as usize * self.format.bytes_per_pixel()
     }
 
+    /// Where the file has a pixel of the frame.
+    fn offset_in_frame(&self, x: u32, y: u32) -> u64 {
+        self.offset(x - self.window.x0(), y - self.window.y0())
+    }
+
     fn offset(&self, x: u32, y: u32) -> u64 {
         let pixels = u64::from(y) * u64::from(self.window.width()) + u64::from(x);
         pixels * self.format.bytes_per_pixel() as u64
     }
 }
 
-/// Says why [`Picture::put`] would refuse `pixels`, whatever the state of its file.
-pub fn check_pixels(area: Area, pixels: &[[f32; 3]]) -> Result<(), PutError> {
-    if pixels.len() != area.pixel_count() {
-        return Err(PutError::PixelCount { expected: area.pixel_count(), found: pixels.len() });
-    }
-    match pixels.iter().position(|pixel| pixel.iter().any(|channel| channel.is_nan())) {
-        Some(index) => {
-            let (x, y) = area.pixel_at(index as u32);
-            Err(PutError::NotANumber { x, y })
+/// Gives an empty file its length, and reserves its bytes where the file system can.
+pub(crate) fn reserve(file: &File, byte_count: u64) -> io::Result<()> {
+    loop {
+        match fallocate(file, FallocateFlags::empty(), 0, byte_count) {
+            Ok(()) => return Ok(()),
+            Err(Errno::OPNOTSUPP) => return file.set_len(byte_count),
+            Err(Errno::INTR) => {}
+            Err(error) => return Err(error.into()),
         }
-        None => Ok(()),
     }
+}
+
+impl TilePixels<'_> {
+    /// Says why [`Picture::put_all`] would refuse these pixels, whatever the state of its file.
+    pub fn check(&self) -> Result<(), PutError> {
+        let Self { area, bytes } = *self;
+        let (pixels, rest) = bytes.as_chunks::<PIXEL_BYTES>();
+        if pixels.len() != area.pixel_count() || !rest.is_empty() {
+            let expected = area.pixel_count() * PIXEL_BYTES;
+            return Err(PutError::ByteCount { expected, found: bytes.len() });
+        }
+        match pixels.iter().position(|pixel| channels(pixel).iter().any(|light| light.is_nan())) {
+            Some(index) => {
+                let (x, y) = area.pixel_at(index as u32);
+                Err(PutError::NotANumber { x, y })
+            }
+            None => Ok(()),
+        }
+    }
+}
+
+/// Pixels as [`TilePixels`] has them, without a copy.
+pub fn pixel_bytes(pixels: &[[f32; 3]]) -> &[u8] {
+    const { assert!(cfg!(target_endian = "little"), "a prepared scene and pixels travel as they are") };
+    bytemuck::cast_slice(pixels)
+}
+
+/// A pixel's channels.
+pub(crate) fn channels(pixel: &[u8; PIXEL_BYTES]) -> [f32; 3] {
+    let channel = |index: usize| {
+        f32::from_le_bytes([pixel[index], pixel[index + 1], pixel[index + 2], pixel[index + 3]])
+    };
+    [channel(0), channel(4), channel(8)]
 }
 
 #[cfg(test)]
@@ -273,7 +369,40 @@ mod tests {
         let error = picture.put(area, &[[0.0; 3], [0.0, f32::NAN, 0.0]]).unwrap_err();
         assert_eq!(error.to_string(), "the pixel (2, 2) is not a number");
         let error = picture.put(area, &[[0.0; 3]]).unwrap_err();
-        assert_eq!(error.to_string(), "a tile of 2 pixels came with 1");
+        assert_eq!(error.to_string(), "a tile of 24 bytes came with 12");
+    }
+
+    #[test]
+    fn tiles_put_together_are_where_they_were_put_one_by_one() {
+        let size = Size::new(101, 67).unwrap();
+        let grid = TileGrid::new(size, 16).unwrap();
+        let tiles = grid.render_order();
+        let pixels: Vec<Vec<[f32; 3]>> = tiles
+            .iter()
+            .map(|&tile| grid.area(tile).pixels().map(|(x, y)| ramp(x, y)).collect())
+            .collect();
+        let encoded = |format, at_once| {
+            let file = tempfile::tempfile().unwrap();
+            let picture = Picture::new(file, size, format, Transfer::None).unwrap();
+            let tiles: Vec<TilePixels> = std::iter::zip(&tiles, &pixels)
+                .map(|(&tile, pixels)| TilePixels {
+                    area: grid.area(tile),
+                    bytes: pixel_bytes(pixels),
+                })
+                .collect();
+            for tiles in tiles.chunks(at_once) {
+                picture.put_all(tiles).unwrap();
+            }
+            let mut out = Cursor::new(Vec::new());
+            picture.encode(&mut out).unwrap();
+            out.into_inner()
+        };
+        for format in [PictureFormat::Png8, PictureFormat::Png16, PictureFormat::ExrF32] {
+            let one_by_one = encoded(format, 1);
+            for at_once in [3, 8, tiles.len()] {
+                assert!(encoded(format, at_once) == one_by_one, "{format:?}, {at_once} at once");
+            }
+        }
     }
 
     #[test]

@@ -3,11 +3,11 @@
 use prost::bytes::Bytes;
 use rtfarm_core::{
     prepared::SceneHash,
-    render::{Cutoff, Quality, SampleLimit, Sampling, Settings, StandardError, Tally},
+    render::{Quality, SampleLimit, Sampling, Settings, StandardError, Tally},
     tile::{Crop, CropError, Size, SizeError},
     transfer::Transfer,
 };
-use rtfarm_picture::PictureFormat;
+use rtfarm_picture::{PictureFormat, pixel_bytes};
 
 use crate::wire;
 
@@ -20,18 +20,12 @@ pub enum WireError {
     /// A hash has another length than 32 bytes.
     #[error("a hash has 32 bytes, not {0}")]
     HashLength(usize),
-    /// Pixels are no whole number of three f32.
-    #[error("pixels have 12 bytes each, which {0} bytes are not")]
-    PixelLength(usize),
     /// A number is out of its range.
     #[error("{0} samples a pixel are out of range")]
     Samples(u32),
     /// A number is out of its range.
     #[error("an error of {0} is out of range")]
     Error(f64),
-    /// A number is out of its range.
-    #[error("a cut-off of {0} is out of range")]
-    Cutoff(f64),
     /// There is no such transfer curve.
     #[error("no transfer curve has the number {0}")]
     Transfer(i32),
@@ -92,7 +86,7 @@ impl TryFrom<wire::Quality> for Quality {
     type Error = WireError;
 
     fn try_from(quality: wire::Quality) -> Result<Self, WireError> {
-        let wire::Quality { sampling, seed, flat, secondary, cutoff } = quality;
+        let wire::Quality { sampling, seed, flat, secondary } = quality;
         let sampling = match sampling.ok_or(WireError::Missing("sampling"))? {
             wire::quality::Sampling::Samples(count) => {
                 Sampling::fixed(count).ok_or(WireError::Samples(count))?
@@ -104,14 +98,13 @@ impl TryFrom<wire::Quality> for Quality {
                 }
             }
         };
-        let cutoff = Cutoff::new(cutoff).ok_or(WireError::Cutoff(cutoff))?;
-        Ok(Self { sampling, seed, flat, secondary, cutoff })
+        Ok(Self { sampling, seed, flat, secondary })
     }
 }
 
 impl From<Quality> for wire::Quality {
     fn from(quality: Quality) -> Self {
-        let Quality { sampling, seed, flat, secondary, cutoff } = quality;
+        let Quality { sampling, seed, flat, secondary } = quality;
         let sampling = Some(match sampling {
             Sampling::Fixed(count) => wire::quality::Sampling::Samples(count.get()),
             Sampling::Adaptive { error, most } => {
@@ -119,7 +112,7 @@ impl From<Quality> for wire::Quality {
                 wire::quality::Sampling::Adaptive(wire::Adaptive { error, most })
             }
         });
-        Self { sampling, seed, flat, secondary, cutoff: cutoff.get() }
+        Self { sampling, seed, flat, secondary }
     }
 }
 
@@ -127,18 +120,21 @@ impl TryFrom<wire::Tally> for Tally {
     type Error = WireError;
 
     fn try_from(tally: wire::Tally) -> Result<Self, WireError> {
-        let wire::Tally { rays, samples, cut, estimated, variance, capped } = tally;
-        let is_possible = (0.0..=1.0).contains(&cut) && variance.is_finite() && variance >= 0.0;
-        is_possible
-            .then_some(Self { rays, samples, cut, estimated, variance, capped })
+        let wire::Tally { rays, samples, untraced, estimated, variance, capped, most_untraced } =
+            tally;
+        let is_possible = |sum: f64| sum.is_finite() && sum >= 0.0;
+        [untraced, variance, most_untraced]
+            .into_iter()
+            .all(is_possible)
+            .then_some(Self { rays, samples, untraced, most_untraced, estimated, variance, capped })
             .ok_or(WireError::Tally)
     }
 }
 
 impl From<Tally> for wire::Tally {
     fn from(tally: Tally) -> Self {
-        let Tally { rays, samples, cut, estimated, variance, capped } = tally;
-        Self { rays, samples, cut, estimated, variance, capped }
+        let Tally { rays, samples, untraced, most_untraced, estimated, variance, capped } = tally;
+        Self { rays, samples, untraced, estimated, variance, capped, most_untraced }
     }
 }
 
@@ -189,19 +185,15 @@ pub fn scene_hash(bytes: &[u8]) -> Result<SceneHash, WireError> {
     bytes.try_into().map(SceneHash).map_err(|_| WireError::HashLength(bytes.len()))
 }
 
-/// Pixels as they travel: little-endian f32, row by row.
-pub fn pixels_to_bytes(pixels: &[[f32; 3]]) -> Bytes {
-    pixels.iter().flatten().flat_map(|channel| channel.to_le_bytes()).collect()
-}
-
-/// Reads pixels that have travelled.
-pub fn pixels_from_bytes(bytes: &[u8]) -> Result<Vec<[f32; 3]>, WireError> {
-    let (channels, rest) = bytes.as_chunks::<4>();
-    let channels: Vec<f32> = channels.iter().map(|&bytes| f32::from_le_bytes(bytes)).collect();
-    match channels.as_chunks::<3>() {
-        (pixels, []) if rest.is_empty() => Ok(pixels.to_vec()),
-        _ => Err(WireError::PixelLength(bytes.len())),
+/// Pixels as they travel: little-endian f32, row by row. They are not copied.
+pub fn pixels_to_bytes(pixels: Vec<[f32; 3]>) -> Bytes {
+    struct Pixels(Vec<[f32; 3]>);
+    impl AsRef<[u8]> for Pixels {
+        fn as_ref(&self) -> &[u8] {
+            pixel_bytes(&self.0)
+        }
     }
+    Bytes::from_owner(Pixels(pixels))
 }
 
 #[cfg(test)]
@@ -211,22 +203,8 @@ mod tests {
     #[test]
     fn pixels_travel_bit_for_bit() {
         let pixels = [[0.0, -0.0, f32::INFINITY], [1e-45, f32::MAX, -1.5]];
-        let back = pixels_from_bytes(&pixels_to_bytes(&pixels)).unwrap();
-        let bits = |pixels: &[[f32; 3]]| -> Vec<u32> {
-            pixels.iter().flatten().map(|channel| channel.to_bits()).collect()
-        };
-        assert_eq!(bits(&back), bits(&pixels));
-    }
-
-    #[test]
-    fn pixels_cut_short_are_refused() {
-        for length in [1, 4, 11, 13, 16, 20, 23] {
-            assert_eq!(
-                pixels_from_bytes(&vec![0; length]),
-                Err(WireError::PixelLength(length)),
-                "{length} bytes"
-            );
-        }
+        let bytes: Vec<u8> = pixels.as_flattened().iter().flat_map(|c| c.to_le_bytes()).collect();
+        assert_eq!(pixels_to_bytes(pixels.to_vec()), bytes);
     }
 
     #[test]
@@ -243,13 +221,8 @@ mod tests {
     #[test]
     fn settings_out_of_range_are_refused() {
         use wire::quality::Sampling::{Adaptive, Samples};
-        let quality = wire::Quality {
-            sampling: Some(Samples(1)),
-            seed: 9,
-            flat: true,
-            secondary: false,
-            cutoff: 0.5,
-        };
+        let quality =
+            wire::Quality { sampling: Some(Samples(1)), seed: 9, flat: true, secondary: false };
         let frame = wire::Frame { width: 2, height: 3 };
         let good = wire::Settings { frame: Some(frame), quality: Some(quality) };
         let settings = Settings::try_from(good).unwrap();
@@ -261,8 +234,6 @@ mod tests {
         let adaptive = |error, most| Some(Adaptive(wire::Adaptive { error, most }));
         Quality::try_from(wire::Quality { sampling: adaptive(0.1, 8), ..quality }).unwrap();
         for bad in [
-            wire::Quality { cutoff: f64::NAN, ..quality },
-            wire::Quality { cutoff: 2.0, ..quality },
             wire::Quality { sampling: None, ..quality },
             wire::Quality { sampling: Some(Samples(0)), ..quality },
             wire::Quality { sampling: Some(Samples(65_537)), ..quality },

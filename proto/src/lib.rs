@@ -8,7 +8,7 @@ mod name;
 mod tile_hash;
 
 pub use address::{Address, AddressError};
-pub use convert::{WireError, pixels_from_bytes, pixels_to_bytes, scene_hash, transfer};
+pub use convert::{WireError, pixels_to_bytes, scene_hash, transfer};
 pub use name::{FarmId, Incarnation, JobId, LeaseId, LeaseName, Renewal, WorkerId};
 pub use prost::bytes::Bytes;
 pub use tile_hash::TileHasher;
@@ -25,11 +25,14 @@ pub mod wire {
 }
 
 /// The version of `farm.proto`. Both sides must have the same, and the same package version.
-pub const PROTOCOL: u32 = 5;
+pub const PROTOCOL: u32 = 9;
 
 /// The largest message that either side takes: a tile of the largest side, 12 bytes a pixel, and
 /// room for what stands around it.
 pub const MESSAGE_BYTES: usize = 1024 * 1024 * 12 + (1 << 16);
+
+/// Tiles in one message have at most so many bytes of pixels together, unless it is one tile.
+pub const DELIVERY_BYTES: usize = 1 << 20;
 
 /// The size of a piece of a stream.
 pub const CHUNK_BYTES: usize = 1 << 20;

@@ -36,12 +36,14 @@ pub struct LeaseName {
 }
 
 /// How far the work under a lease is.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Renewal {
     /// The lease.
     pub lease: LeaseName,
-    /// Steps that were made for its own tiles, since it began.
+    /// Steps that brought its scene, since it began.
     pub work: u64,
+    /// The numbers of its tiles that were begun and not delivered, and the steps made for each.
+    pub tiles: Vec<(u32, u64)>,
 }
 
 impl fmt::Display for FarmId {
@@ -73,13 +75,15 @@ impl TryFrom<wire::Renewal> for Renewal {
 
     fn try_from(renewal: wire::Renewal) -> Result<Self, WireError> {
         let lease = renewal.lease.ok_or(WireError::Missing("lease"))?.into();
-        Ok(Self { lease, work: renewal.work })
+        let tiles = renewal.tiles.into_iter().map(|wire::TileWork { tile, work }| (tile, work));
+        Ok(Self { lease, work: renewal.work, tiles: tiles.collect() })
     }
 }
 
 impl From<Renewal> for wire::Renewal {
     fn from(renewal: Renewal) -> Self {
-        Self { lease: Some(renewal.lease.into()), work: renewal.work }
+        let tiles = renewal.tiles.into_iter().map(|(tile, work)| wire::TileWork { tile, work });
+        Self { lease: Some(renewal.lease.into()), work: renewal.work, tiles: tiles.collect() }
     }
 }
 

@@ -454,6 +454,118 @@ fn a_coordinator_killed_and_started_again_gives_the_next_picture_no_pixel_of_the
 }
 
 #[test]
+fn a_killed_coordinator_with_a_state_goes_on_and_loses_no_finished_tile() {
+    let place = Place::new();
+    let here = place.render("here.png", &[&SLOW[..], &["--workers", "0"]].concat());
+    let coordinator = ["coordinator", "--state", "state", "--listen"];
+    let mut first = place.start("first.log", &[&coordinator[..], &["127.0.0.1:0"]].concat());
+    let line = first.read_line();
+    let url = line.trim().strip_prefix("listening on ").expect(&line).to_owned();
+    let address = url.strip_prefix("http://").unwrap();
+    let worker = ["worker", "--threads", "1", "--coordinator", &url];
+    let workers = ["a.log", "b.log"].map(|log| place.start(log, &worker));
+    let args = [&["submit", "scene.rt", "-o", "out.png", "--coordinator", &url], &SLOW[..]];
+    let mut submit = place.start("submit.log", &args.concat());
+
+    let mut killed = first;
+    let mut done = BTreeSet::new();
+    for (log, tile_count) in [("second.log", 30), ("third.log", 60)] {
+        poll(|| (killed.tiles_done() >= tile_count).then_some(()));
+        check_refused(
+            &place,
+            &[&coordinator[..], &["127.0.0.1:0"]].concat(),
+            1,
+            "another coordinator",
+        );
+        killed.signal(Signal::KILL);
+        killed.wait();
+        let finished = finished_tiles(&killed.log());
+        assert!(finished.iter().all(|&tile| done.insert(tile)), "a tile was finished twice");
+        let mut next = place.start(log, &[&coordinator[..], &[address]].concat());
+        next.read_line();
+        killed = next;
+    }
+    assert!(submit.wait().success(), "{}", submit.log());
+    assert!(fs::read(place.path("out.png")).unwrap() == here, "{}", killed.log());
+    let finished = finished_tiles(&killed.log());
+    assert!(finished.iter().all(|&tile| done.insert(tile)), "a tile was finished twice");
+    poll(|| (fs::read_dir(place.path("state/jobs")).unwrap().count() == 0).then_some(()));
+    killed.signal(Signal::TERM);
+    assert_eq!(killed.wait().code(), Some(0), "{}", killed.log());
+    for mut worker in workers {
+        assert!(worker.wait().success(), "sent home: {}", worker.log());
+    }
+    fs::write(place.path("state/farm"), "another thing").unwrap();
+    check_refused(&place, &[&coordinator[..], &[address]].concat(), 1, "it is no record of a farm");
+    let foreign = ["coordinator", "--listen", address, "--state", "."];
+    check_refused(&place, &foreign, 2, ". is not empty and holds no state of a farm");
+    place.check_nothing_is_left();
+}
+
+#[test]
+fn a_state_on_a_full_disk_refuses_a_job_and_goes_on() {
+    let place = Place::new();
+    with_small_disk(&place, "64k", || {
+        let coordinator = ["coordinator", "--listen", "127.0.0.1:0", "--state", "disk/state"];
+        let mut coordinator = place.start("coordinator.log", &coordinator);
+        let line = coordinator.read_line();
+        let url = line.trim().strip_prefix("listening on ").expect(&line).to_owned();
+        let submit = ["submit", "scene.rt", "--coordinator", &url, "--samples", "1", "-o"];
+        let large = [&submit[..], &["large.png", "--size", "512x512"]].concat();
+        check_refused(&place, &large, 2, "No space left on device");
+        let worker = ["worker", "--threads", "1", "--coordinator", &url];
+        let _worker = place.start("worker.log", &worker);
+        let mut small =
+            place.start("small.log", &[&submit[..], &["small.png", "--size", "64x48"]].concat());
+        assert!(small.wait().success(), "{}", small.log());
+        assert_eq!(fs::read_dir(place.path("disk/state/jobs")).unwrap().count(), 0);
+        coordinator.signal(Signal::TERM);
+        coordinator.wait();
+    });
+}
+
+#[test]
+fn an_interrupted_render_goes_on_where_it_was() {
+    let place = Place::new();
+    let here = place.render("here.png", &[&SLOW[..], &["--workers", "0"]].concat());
+    let args = [&["render", "scene.rt", "-o", "out.png", "--resume", "--workers"], &SLOW[..]];
+    for workers in ["0", "2"] {
+        let args = [args[0], &[workers], args[1]].concat();
+        let mut first = place.start("first.log", &args);
+        poll(|| (first.tiles_done() >= 30).then_some(()));
+        check_refused(&place, &args, 1, "another rtfarm is rendering there");
+        first.signal(Signal::KILL);
+        first.wait();
+        let done = finished_tiles(&first.log());
+        let mut second = place.start("second.log", &args);
+        assert!(second.wait().success(), "{}", second.log());
+        let log = second.log();
+        assert!(log.contains("going on with "), "{log}");
+        assert!(finished_tiles(&log).iter().all(|tile| !done.contains(tile)), "{log}");
+        assert!(fs::read(place.path("out.png")).unwrap() == here);
+        assert!(!place.path("out.png.rtfarm").exists());
+
+        let mut first = place.start("first.log", &args);
+        poll(|| (first.tiles_done() >= 1).then_some(()));
+        first.signal(Signal::INT);
+        assert_eq!(first.wait().code(), Some(130), "{}", first.log());
+        let other = [
+            &["render", "scene.rt", "-o", "out.png", "--resume", "--seed", "3"][..],
+            &["--size", "32x32", "--workers", workers],
+        ];
+        let mut other = place.start("other.log", &other.concat());
+        assert!(other.wait().success(), "{}", other.log());
+        assert!(other.log().contains("beginning anew, since "), "{}", other.log());
+        assert!(!place.path("out.png.rtfarm").exists());
+    }
+    fs::create_dir(place.path("out.png.rtfarm")).unwrap();
+    fs::write(place.path("out.png.rtfarm/letter"), "dear").unwrap();
+    let args = ["render", "scene.rt", "-o", "out.png", "--resume", "--size", "32x32"];
+    check_refused(&place, &args, 1, "it holds something else: letter");
+    poll(|| (fs::read_dir(place.path("tmp")).unwrap().count() <= 1).then_some(()));
+}
+
+#[test]
 fn an_interrupted_submit_ends_its_job() {
     let place = Place::new();
     let mut coordinator =

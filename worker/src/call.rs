@@ -3,7 +3,7 @@
 use std::{sync::Arc, time::Duration};
 
 use rtfarm_core::{render::Tally, tile::TileId};
-use rtfarm_proto::{Bytes, FarmId, Incarnation, LONGEST_WAIT, LeaseName, Renewal, WorkerId};
+use rtfarm_proto::{Bytes, FarmId, Incarnation, JobId, LONGEST_WAIT, LeaseName, Renewal, WorkerId};
 
 use crate::job::Job;
 
@@ -21,14 +21,21 @@ pub(crate) enum Call {
     Connect,
     /// Makes this process a member.
     Join,
-    /// Asks for tiles; the answer may take as long as `wait`.
-    Lease { member: Membership, most_tiles: usize, wait: Duration },
+    /// Asks for tiles, first of all for those that are `kept`; the answer may take as long as `wait`.
+    Lease { member: Membership, most_tiles: usize, wait: Duration, kept: Option<KeptTiles> },
     /// Proves progress under leases.
     Renew { member: Membership, renewals: Vec<Renewal> },
-    /// Brings a tile.
-    Deliver { member: Membership, tile: Delivery },
+    /// Brings tiles.
+    Deliver { member: Membership, tiles: Vec<Delivery> },
     /// Gives every lease back.
     Leave { member: Membership, reason: String },
+}
+
+/// Tiles of a job whose pixels this worker has, for an earlier start of the coordinator.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct KeptTiles {
+    pub(crate) job: JobId,
+    pub(crate) tiles: Vec<TileId>,
 }
 
 /// What the coordinator answers to a [`Call`].

@@ -10,7 +10,7 @@ use rtfarm_proto::{
 use tonic::{Code, Status, transport::Channel};
 
 use crate::{
-    call::{Answer, Call, CallError, CallErrorKind, Delivery, Membership, Next, Run},
+    call::{Answer, Call, CallError, CallErrorKind, Delivery, KeptTiles, Membership, Next, Run},
     config::Config,
     job::{Job, JobError},
 };
@@ -40,6 +40,8 @@ pub(crate) fn introduction(config: &Config, nonce: u64) -> wire::JoinRequest {
         isa: config.isa.to_string(),
         host: rustix::system::uname().nodename().to_string_lossy().into_owned(),
         process: std::process::id(),
+        build: config.build.clone(),
+        reference: config.reference.map(|hash| hash.to_vec().into()).unwrap_or_default(),
     }
 }
 
@@ -62,12 +64,16 @@ pub(crate) async fn ask(
             let farm = farm.map_err(|_| JobError::from(WireError::Missing("farm")))?;
             Ok(Answer::Joined { member, farm, term })
         }
-        Call::Lease { member, most_tiles, wait } => {
+        Call::Lease { member, most_tiles, wait, kept } => {
             let request = wire::LeaseRequest {
                 worker: member.worker.0,
                 incarnation: member.incarnation.0,
                 max_tiles: u32::try_from(most_tiles).unwrap_or(u32::MAX),
                 wait_ms: u32::try_from(wait.as_millis()).unwrap_or(u32::MAX),
+                kept: kept.map(|KeptTiles { job, tiles }| wire::KeptTiles {
+                    job: job.0,
+                    tiles: tiles.iter().map(|tile| tile.number()).collect(),
+                }),
             };
             let answer = client.lease(request).await?.into_inner();
             Ok(Answer::Leased(read_next(answer, member.incarnation)?))
@@ -82,10 +88,14 @@ pub(crate) async fn ask(
             let lost = renewed.into_inner().lost.into_iter().map(Into::into).collect();
             Ok(Answer::Renewed { lost })
         }
-        Call::Deliver { member, tile } => {
-            let number = tile.tile.number();
-            let delivered = client.deliver(write_delivery(member, tile)).await?.into_inner();
-            tracing::debug!(tile = number, verdict = ?delivered.verdict(), "delivered");
+        Call::Deliver { member, tiles } => {
+            let request = wire::DeliverRequest {
+                worker: member.worker.0,
+                incarnation: member.incarnation.0,
+                tiles: tiles.into_iter().map(write_tile).collect(),
+            };
+            let delivered = client.deliver(request).await?.into_inner();
+            tracing::debug!(verdicts = ?delivered.verdicts, "delivered");
             Ok(Answer::Delivered)
         }
         Call::Leave { member, reason } => {
@@ -96,16 +106,15 @@ pub(crate) async fn ask(
     }
 }
 
-fn write_delivery(member: Membership, delivery: Delivery) -> wire::DeliverRequest {
-    wire::DeliverRequest {
-        worker: member.worker.0,
-        incarnation: member.incarnation.0,
-        lease: Some(delivery.lease.into()),
-        tile: delivery.tile.number(),
-        pixels: delivery.pixels,
-        hash: delivery.hash.to_vec().into(),
-        seconds: delivery.seconds,
-        tally: Some(delivery.tally.into()),
+fn write_tile(tile: Delivery) -> wire::FinishedTile {
+    let Delivery { lease, tile, pixels, hash, tally, seconds } = tile;
+    wire::FinishedTile {
+        lease: Some(lease.into()),
+        tile: tile.number(),
+        pixels,
+        hash: hash.to_vec().into(),
+        seconds,
+        tally: Some(tally.into()),
     }
 }
 

@@ -16,6 +16,11 @@ pub struct Config {
     pub isa: Isa,
     /// The version of the package; the coordinator must have the same.
     pub version: String,
+    /// Of the sources that pixels depend on; likewise.
+    pub build: String,
+    /// What [`crate::reference()`] makes of the instruction set; none where the coordinator does not
+    /// ask for it.
+    pub reference: Option<[u8; 32]>,
     /// How long it goes on without a coordinator, from the first failure on.
     pub patience: Duration,
 }

@@ -10,8 +10,12 @@ use std::{
     time::Duration,
 };
 
+use rtfarm_core::tile::TileId;
 use rtfarm_proto::LeaseName;
 use tokio::{sync::mpsc, time::Instant};
+
+/// What steps were made for: a tile of a lease, or the lease's scene.
+pub(crate) type Object = (LeaseName, Option<TileId>);
 
 /// Whoever makes progress beats it; it is heard at most once a period.
 #[derive(Debug)]
@@ -21,8 +25,8 @@ pub(crate) struct Pulse {
     /// Milliseconds from `start`.
     next_beat: AtomicU64,
     send: mpsc::Sender<()>,
-    /// Beats under each lease that nobody has counted yet.
-    beats: Mutex<BTreeMap<LeaseName, u64>>,
+    /// Beats that nobody has counted yet.
+    beats: Mutex<BTreeMap<Object, u64>>,
 }
 
 impl Pulse {
@@ -33,9 +37,9 @@ impl Pulse {
         (Self { start, period, next_beat, send, beats: Mutex::default() }, receive)
     }
 
-    /// Event: some work was done for a tile of a lease.
-    pub(crate) fn beat(&self, lease: LeaseName) {
-        *self.beats.lock().unwrap_or_else(PoisonError::into_inner).entry(lease).or_default() += 1;
+    /// Event: a step was made for a tile of a lease, or for the lease's scene.
+    pub(crate) fn beat(&self, object: Object) {
+        *self.beats.lock().unwrap_or_else(PoisonError::into_inner).entry(object).or_default() += 1;
         let now = self.start.elapsed().as_millis() as u64;
         let next = self.next_beat.load(Ordering::Relaxed);
         let after = now + self.period.as_millis() as u64;
@@ -50,8 +54,8 @@ impl Pulse {
         }
     }
 
-    /// Counts the beats under each lease since they were counted last.
-    pub(crate) fn count(&self) -> BTreeMap<LeaseName, u64> {
+    /// Counts the beats since they were counted last.
+    pub(crate) fn count(&self) -> BTreeMap<Object, u64> {
         mem::take(&mut *self.beats.lock().unwrap_or_else(PoisonError::into_inner))
     }
 }

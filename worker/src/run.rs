@@ -32,6 +32,7 @@ use crate::{
     config::Config,
     error::WorkerError,
     job::Job,
+    outbox::Outbox,
     pulse::Pulse,
     scene::{Scene, SceneError, load},
     task::{Action, TaskId},
@@ -57,9 +58,12 @@ pub async fn run(
         }
         tokio::select! {
             Some(report) = shell.reports.join_next() => shell.pass_on(report, &mut worker),
-            Some((task, tile)) = shell.rendered.recv() => {
-                shell.renderings.remove(&task);
-                worker.on_tile_rendered(task, tile, now());
+            () = shell.outbox.due() => {
+                let rendered = shell.outbox.take();
+                for (task, _) in &rendered {
+                    shell.renderings.remove(task);
+                }
+                worker.on_tiles_rendered(rendered, now());
             }
             Some(()) = shell.beats.recv() => worker.on_beat(&shell.pulse.count(), now()),
             () = sleep_until(worker.wake_at()) => worker.on_tick(now()),
@@ -101,8 +105,7 @@ struct Shell {
     running: HashMap<TaskId, AbortHandle>,
     pool: ThreadPool,
     renderings: HashMap<TaskId, Rendering>,
-    send_rendered: mpsc::Sender<(TaskId, Option<Delivery>)>,
-    rendered: mpsc::Receiver<(TaskId, Option<Delivery>)>,
+    outbox: Arc<Outbox>,
     pulse: Arc<Pulse>,
     beats: mpsc::Receiver<()>,
 }
@@ -133,11 +136,11 @@ impl Shell {
             .num_threads(config.threads)
             .thread_name(|index| format!("render-{index}"))
             .build()?;
-        let (send_rendered, rendered) = mpsc::channel(config.threads);
         // Nothing beats before the worker has joined and chosen the period.
         let (pulse, beats) = Pulse::new(Duration::ZERO);
         Ok(Self {
             introduction: Arc::new(client::introduction(&config, nonce)),
+            outbox: Arc::new(Outbox::new(config.threads)),
             config,
             client: None,
             scenes: HashMap::new(),
@@ -145,8 +148,6 @@ impl Shell {
             running: HashMap::new(),
             pool,
             renderings: HashMap::new(),
-            send_rendered,
-            rendered,
             pulse: Arc::new(pulse),
             beats,
         })
@@ -236,12 +237,13 @@ impl Shell {
         let is_stopped = Arc::new(AtomicBool::new(false));
         self.renderings.insert(task, Rendering { is_stopped: Arc::clone(&is_stopped) });
         let scene = Arc::clone(&self.scenes[&job.scene]);
-        let (pulse, send) = (Arc::clone(&self.pulse), self.send_rendered.clone());
+        let (pulse, outbox) = (Arc::clone(&self.pulse), Arc::clone(&self.outbox));
+        outbox.on_begun();
         let isa = self.config.isa;
         self.pool.spawn_fifo(move || {
             let started = Instant::now();
             let mut on_progress = || {
-                pulse.beat(lease);
+                pulse.beat((lease, Some(tile)));
                 if is_stopped.load(Ordering::Relaxed) {
                     ControlFlow::Break(())
                 } else {
@@ -256,13 +258,12 @@ impl Shell {
                 ControlFlow::Break(()) => None,
             };
             let delivery = rendered.map(|rendered| {
-                let pixels = pixels_to_bytes(&rendered.pixels);
+                let pixels = pixels_to_bytes(rendered.pixels);
                 let hash = job.hasher.hash(tile, &pixels);
                 let seconds = started.elapsed().as_secs_f64();
                 Delivery { lease, tile, pixels, hash, tally: rendered.tally, seconds }
             });
-            // Nobody listens when the worker has ended.
-            let _ = send.blocking_send((task, delivery));
+            outbox.put((task, delivery));
         });
     }
 }

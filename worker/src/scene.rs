@@ -69,10 +69,10 @@ pub(crate) async fn load(
 ) -> Result<Arc<Scene>, SceneError> {
     let file = match &job.scene_path {
         Some(path) if is_local => find(path)?,
-        _ => fetch(&job, silence, client, &|| pulse.beat(lease)).await?,
+        _ => fetch(&job, silence, client, &|| pulse.beat((lease, None))).await?,
     };
     let opened =
-        tokio::task::spawn_blocking(move || open(&file, &job, &|| pulse.beat(lease))).await;
+        tokio::task::spawn_blocking(move || open(&file, &job, &|| pulse.beat((lease, None)))).await;
     opened.map_err(io::Error::other)?
 }
 

@@ -12,15 +12,21 @@ use rtfarm_core::{prepared::SceneHash, tile::TileId};
 use rtfarm_proto::LeaseName;
 
 use crate::{
-    call::{Call, CallError, CallErrorKind},
+    call::{Call, CallError, CallErrorKind, Delivery},
     error::WorkerError,
     job::Job,
 };
 
 /// Something that was begun and will report back once. Numbers are never given twice, so that a
 /// report that comes too late is known.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub(crate) struct TaskId(u64);
+
+/// A rendering that has ended; it has no pixels if it was stopped.
+pub(crate) type Rendered = (TaskId, Option<Delivery>);
+
+/// Finished tiles are heard of no more often than this while the threads have others to render.
+pub(crate) const TURN: Duration = Duration::from_millis(10);
 
 /// What the shell is to do.
 #[derive(Debug)]
@@ -247,14 +253,20 @@ impl Tasks {
         self.actions.extend(stopped.map(|(&task, _)| Action::Stop(task)));
     }
 
-    /// Stops everything; nobody waits for any report any more.
-    pub(crate) fn stop_all(&mut self) {
+    /// Stops everything; nobody waits for any report any more. Answers with the calls that were not
+    /// answered.
+    pub(crate) fn stop_all(&mut self) -> Vec<Call> {
         self.timers.clear();
         self.silent_since = None;
+        let mut unanswered = Vec::new();
         for (task, stopped) in std::mem::take(&mut self.begun) {
             if !matches!(stopped, Task::Failed(_)) {
                 self.actions.push_back(Action::Stop(task));
             }
+            if let Task::Asked { attempts, .. } | Task::Failed(attempts) = stopped {
+                unanswered.push(attempts.call);
+            }
         }
+        unanswered
     }
 }

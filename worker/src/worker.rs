@@ -10,31 +10,34 @@ use std::{
 };
 
 use rtfarm_core::{prepared::SceneHash, tile::TileId};
-use rtfarm_proto::{Address, LONGEST_WAIT, LeaseName, Renewal};
+use rtfarm_proto::{Address, DELIVERY_BYTES, FarmId, JobId, LONGEST_WAIT, LeaseName, Renewal};
 
 use crate::{
-    call::{Answer, Call, CallError, CallErrorKind, Delivery, Membership, Next, Run},
+    call::{Answer, Call, CallError, CallErrorKind, Delivery, KeptTiles, Membership, Next, Run},
     config::Config,
     error::WorkerError,
     job::Job,
+    pulse::Object,
     scene::SceneError,
-    task::{Action, GivenUp, TaskId, Tasks},
+    task::{Action, GivenUp, Rendered, TURN, TaskId, Tasks},
 };
 
-/// Tiles that a thread may have before it, so that it never waits for the network. As many may
-/// be on their way to the coordinator.
-const TILES_AHEAD: usize = 2;
+/// Turns of tiles that a thread may have before it, so that it never waits for the network. As many
+/// may be on their way to the coordinator. A turn is a tile, or as many small ones as take a thread
+/// [`TURN`].
+const TURNS_AHEAD: usize = 2;
 
-/// Tiles that are handed to the threads at once, for each of them: the one that it renders and
+/// Turns that are handed to the threads at once, for each of them: the one that it renders and
 /// those before it.
-const TILES_AT_HAND: usize = 1 + TILES_AHEAD;
+const TURNS_AT_HAND: usize = 1 + TURNS_AHEAD;
 
-/// The most tiles whose pixels may be in memory or in the making, for each thread: a coordinator
+/// The most turns whose pixels may be in memory or in the making, for each thread: a coordinator
 /// that takes pixels slowly stops the threads.
-const MOST_TILES_OF_PIXELS: usize = TILES_AT_HAND + TILES_AHEAD;
+const MOST_TURNS_OF_PIXELS: usize = TURNS_AT_HAND + TURNS_AHEAD;
 
-/// The longest run that is asked for, in tiles a thread.
+/// The longest run that is asked for, for each thread: so many tiles, or so many turns of small ones.
 const LONGEST_RUN_A_THREAD: usize = 32;
+const LONGEST_RUN_IN_TURNS: usize = 16;
 
 /// Progress is told so many times before a lease would run out.
 const BEATS_A_TERM: u32 = 4;
@@ -48,10 +51,16 @@ pub(crate) struct Worker {
     coordinator: Address,
     threads: usize,
     tasks: Tasks,
+    /// The farm that it last joined, and pixels that it rendered for an earlier start of that farm.
+    farm: Option<FarmId>,
+    kept: Kept,
     stage: Stage,
     /// Set when this worker only finishes what its threads have in hand: until when it may.
     drain_until: Option<Instant>,
 }
+
+/// Finished tiles that no coordinator has acknowledged.
+type Kept = BTreeMap<(JobId, TileId), Delivery>;
 
 #[derive(Debug)]
 enum Stage {
@@ -76,10 +85,14 @@ struct Member {
     scenes: Vec<SceneHash>,
     /// Tiles that wait for a thread, first come first served.
     waiting: VecDeque<Waiting>,
+    /// The turn of a thread, in tiles: at least one.
+    turn: usize,
     /// Tiles in the hands of the threads.
     rendering_count: usize,
     /// Tiles that wait to be delivered.
     rendered: VecDeque<Delivery>,
+    /// Tiles whose pixels wait to be leased once more.
+    kept: Kept,
     /// Tiles on their way to the coordinator, which has not acknowledged them yet.
     delivering_count: usize,
     is_leasing: bool,
@@ -91,10 +104,12 @@ struct Member {
 struct Held {
     /// Tiles that are not on their way to the coordinator yet: at least one.
     tiles_left: usize,
-    /// Signs of progress under it.
+    /// Steps that brought its scene.
     work: u64,
-    /// Those of them that the coordinator was told of.
-    told: u64,
+    /// Tiles of those left that were begun, and the steps that were made for each.
+    begun: BTreeMap<TileId, u64>,
+    /// There were steps of which the coordinator was not told yet.
+    has_news: bool,
 }
 
 #[derive(Debug)]
@@ -114,6 +129,8 @@ impl Worker {
             coordinator: config.coordinator.clone(),
             threads: config.threads,
             tasks,
+            farm: None,
+            kept: Kept::new(),
             stage: Stage::Joining,
             drain_until: None,
         }
@@ -131,16 +148,19 @@ impl Worker {
 
     /// Event: the coordinator has answered a call.
     pub(crate) fn on_answer(&mut self, task: TaskId, answer: Answer, now: Instant) {
-        if self.tasks.on_answer(task).is_none() {
-            return;
-        }
+        let Some(call) = self.tasks.on_answer(task) else { return };
         match (&mut self.stage, answer) {
             (Stage::Joining, Answer::Connected) => self.tasks.call(Call::Join, now),
             (Stage::Joining, Answer::Joined { member, farm, term }) => {
                 let (worker, coordinator) = (member.worker.0, &self.coordinator);
                 tracing::info!(worker, %coordinator, %farm, "joined");
                 self.tasks.push(Action::HearBeats { period: term / BEATS_A_TERM });
-                self.stage = Stage::Working(Member::new(member, self.threads));
+                // Another farm's jobs have the same numbers.
+                if self.farm.replace(farm) != Some(farm) {
+                    self.kept.clear();
+                }
+                let kept = mem::take(&mut self.kept);
+                self.stage = Stage::Working(Member { kept, ..Member::new(member, self.threads) });
             }
             (Stage::Working(member), Answer::Leased(next)) => {
                 member.is_leasing = false;
@@ -149,15 +169,23 @@ impl Worker {
                     Next::Nothing => {}
                     Next::ShutDown => {
                         tracing::info!(worker = member.id.worker.0, "sent home");
-                        self.end(Ok(()));
+                        return self.end(Ok(()));
                     }
+                }
+                // What was offered and not leased is not wanted.
+                if let Call::Lease { kept: Some(offered), .. } = call {
+                    member.kept.retain(|(job, _), _| *job != offered.job);
                 }
             }
             (Stage::Working(member), Answer::Renewed { lost }) => {
                 member.is_renewing = false;
                 member.on_leases_lost(&lost, &mut self.tasks);
             }
-            (Stage::Working(member), Answer::Delivered) => member.delivering_count -= 1,
+            (Stage::Working(member), Answer::Delivered) => {
+                if let Call::Deliver { tiles, .. } = call {
+                    member.delivering_count -= tiles.len();
+                }
+            }
             (Stage::Leaving(_), Answer::Left) => self.end_as_left(),
             (stage, answer) => unreachable!("{answer:?} was not asked for while {stage:?}"),
         }
@@ -198,24 +226,24 @@ impl Worker {
         }
     }
 
-    /// Event: a thread is done with a tile; it has no pixels if it was stopped.
-    pub(crate) fn on_tile_rendered(&mut self, task: TaskId, tile: Option<Delivery>, now: Instant) {
-        if self.tasks.on_end(task)
-            && let Stage::Working(member) = &mut self.stage
-        {
-            member.rendering_count -= 1;
-            // The pixels are welcome even if the lease was lost meanwhile.
-            member.rendered.extend(tile);
+    /// Event: threads are done with tiles; one has no pixels if it was stopped.
+    pub(crate) fn on_tiles_rendered(&mut self, rendered: Vec<Rendered>, now: Instant) {
+        let awaited = rendered.into_iter().filter(|&(task, _)| self.tasks.on_end(task));
+        let awaited: Vec<Option<Delivery>> = awaited.map(|(_, tile)| tile).collect();
+        if let Stage::Working(member) = &mut self.stage {
+            member.on_rendered(awaited);
             self.proceed(now);
         }
     }
 
-    /// Event: threads or a fetch have made so much progress under leases since the last time.
-    pub(crate) fn on_beat(&mut self, beats: &BTreeMap<LeaseName, u64>, now: Instant) {
+    /// Event: threads or a fetch have made so many steps since the last time.
+    pub(crate) fn on_beat(&mut self, beats: &BTreeMap<Object, u64>, now: Instant) {
         if let Stage::Working(member) = &mut self.stage {
-            for (lease, count) in beats {
-                if let Some(held) = member.leases.get_mut(lease) {
-                    held.work += count;
+            for (&(lease, tile), count) in beats {
+                if let Some(held) = member.leases.get_mut(&lease) {
+                    *tile.map_or(&mut held.work, |tile| held.begun.entry(tile).or_default()) +=
+                        count;
+                    held.has_news = true;
                 }
             }
             self.proceed(now);
@@ -254,7 +282,7 @@ impl Worker {
             (Call::Connect, _) => WorkerError::Connect(self.coordinator.clone(), message),
             (Call::Join, CallErrorKind::Refused) => WorkerError::Refused(message),
             (Call::Join, _) => WorkerError::Gone(message),
-            (_, CallErrorKind::NotMember) => return self.join_again(&message, now),
+            (_, CallErrorKind::NotMember) => return self.join_again(call, &message, now),
             (_, CallErrorKind::Nonsense) => WorkerError::Nonsense(message),
             _ => WorkerError::Gone(message),
         };
@@ -265,14 +293,21 @@ impl Worker {
     }
 
     /// The coordinator does not know this worker any more, nor its leases: it may have been started
-    /// anew. What was rendered for those leases is of no use.
-    fn join_again(&mut self, reason: &str, now: Instant) {
+    /// anew. Finished tiles are kept, for the same farm may lease them once more.
+    fn join_again(&mut self, unheard: Call, reason: &str, now: Instant) {
         tracing::warn!(reason, "joining again");
-        self.tasks.stop_all();
+        let unheard = self.tasks.stop_all().into_iter().chain([unheard]);
         if let Stage::Working(member) = mem::replace(&mut self.stage, Stage::Joining) {
             for scene in member.scenes {
                 self.tasks.push(Action::ForgetScene(scene));
             }
+            let delivered = unheard.filter_map(|call| match call {
+                Call::Deliver { tiles, .. } => Some(tiles),
+                _ => None,
+            });
+            self.kept = member.kept;
+            let tiles = member.rendered.into_iter().chain(delivered.flatten());
+            self.kept.extend(tiles.map(|tile| ((tile.lease.job, tile.tile), tile)));
         }
         if self.drain_until.is_some() {
             return self.end(Ok(()));
@@ -327,20 +362,33 @@ impl Member {
             fetching: None,
             scenes: Vec::new(),
             waiting: VecDeque::new(),
+            turn: 1,
             rendering_count: 0,
             rendered: VecDeque::new(),
+            kept: Kept::new(),
             delivering_count: 0,
             is_leasing: false,
             is_renewing: false,
         }
     }
 
-    fn on_run(&mut self, run: Run, tasks: &mut Tasks) {
+    fn on_run(&mut self, mut run: Run, tasks: &mut Tasks) {
         if run.tiles.is_empty() {
             return;
         }
-        let held = Held { tiles_left: run.tiles.len(), work: 0, told: 0 };
-        self.leases.insert(run.lease, held);
+        let (tiles_left, begun) = (run.tiles.len(), BTreeMap::new());
+        let held = Held { tiles_left, work: 0, begun, has_news: false };
+        let lease = run.lease;
+        self.leases.insert(lease, held);
+        run.tiles.retain(|&tile| {
+            let kept = self.kept.remove(&(lease.job, tile));
+            let is_kept = kept.is_some();
+            self.rendered.extend(kept.map(|kept| Delivery { lease, ..kept }));
+            !is_kept
+        });
+        if run.tiles.is_empty() {
+            return;
+        }
         if self.scenes.contains(&run.job.scene) {
             self.queue(run);
         } else {
@@ -375,14 +423,50 @@ impl Member {
         }
     }
 
+    fn on_rendered(&mut self, tiles: Vec<Option<Delivery>>) {
+        self.rendering_count -= tiles.len();
+        // The pixels are welcome even if the lease was lost meanwhile.
+        let tiles: Vec<Delivery> = tiles.into_iter().flatten().collect();
+        if tiles.is_empty() {
+            return;
+        }
+        let (seconds, bytes) = tiles.iter().fold((0.0, 0), |(seconds, bytes), tile| {
+            (seconds + tile.seconds, bytes + tile.pixels.len())
+        });
+        let in_time = TURN.as_secs_f64() * tiles.len() as f64 / seconds;
+        let in_a_message = DELIVERY_BYTES * tiles.len() / bytes.max(1);
+        self.turn = (in_time as usize).min(in_a_message).max(1);
+        self.rendered.extend(tiles);
+    }
+
+    /// The next tiles to be delivered, as many as a message may hold; none while enough are on their
+    /// way.
+    fn next_delivery(&mut self) -> Vec<Delivery> {
+        let (mut tiles, mut bytes) = (Vec::<Delivery>::new(), 0);
+        while self.delivering_count + tiles.len() < TURNS_AHEAD * self.turn * self.threads
+            && let Some(tile) = self.rendered.front()
+        {
+            bytes += tile.pixels.len();
+            if bytes > DELIVERY_BYTES && !tiles.is_empty() {
+                break;
+            }
+            tiles.extend(self.rendered.pop_front());
+        }
+        for tile in &tiles {
+            self.on_tile_sent(tile.lease, tile.tile);
+        }
+        self.delivering_count += tiles.len();
+        tiles
+    }
+
     /// Begins whatever can be begun now; when it `is_draining`, deliveries alone.
     fn proceed(&mut self, is_draining: bool, tasks: &mut Tasks, now: Instant) {
-        while self.delivering_count < TILES_AHEAD * self.threads
-            && let Some(tile) = self.rendered.pop_front()
-        {
-            self.on_tile_sent(tile.lease);
-            self.delivering_count += 1;
-            tasks.call(Call::Deliver { member: self.id, tile }, now);
+        loop {
+            let tiles = self.next_delivery();
+            if tiles.is_empty() {
+                break;
+            }
+            tasks.call(Call::Deliver { member: self.id, tiles }, now);
         }
         if is_draining {
             self.waiting.clear();
@@ -396,18 +480,25 @@ impl Member {
         self.forget_scenes(tasks);
 
         let tiles_left: usize = self.leases.values().map(|held| held.tiles_left).sum();
-        let is_short = tiles_left < TILES_AHEAD * self.threads;
+        let is_short = tiles_left < TURNS_AHEAD * self.turn * self.threads;
         if is_short && !is_draining && !self.is_leasing && self.fetching.is_none() {
             self.is_leasing = true;
-            let most_tiles = LONGEST_RUN_A_THREAD * self.threads;
-            tasks.call(Call::Lease { member: self.id, most_tiles, wait: LONGEST_WAIT }, now);
+            let longest = LONGEST_RUN_A_THREAD.max(LONGEST_RUN_IN_TURNS * self.turn);
+            let most_tiles = longest * self.threads;
+            let kept = self.kept.keys().next().map(|&(job, _)| KeptTiles {
+                job,
+                tiles: self.kept.keys().filter(|key| key.0 == job).map(|key| key.1).collect(),
+            });
+            let wait = LONGEST_WAIT;
+            tasks.call(Call::Lease { member: self.id, most_tiles, wait, kept }, now);
         }
-        let has_news = self.leases.values().any(|held| held.work > held.told);
+        let has_news = self.leases.values().any(|held| held.has_news);
         if has_news && !self.is_renewing {
             self.is_renewing = true;
             let renewals = self.leases.iter_mut().map(|(&lease, held)| {
-                held.told = held.work;
-                Renewal { lease, work: held.work }
+                held.has_news = false;
+                let tiles = held.begun.iter().map(|(tile, &work)| (tile.number(), work));
+                Renewal { lease, work: held.work, tiles: tiles.collect() }
             });
             let renewals = renewals.collect();
             tasks.call(Call::Renew { member: self.id, renewals }, now);
@@ -420,13 +511,14 @@ impl Member {
 
     fn has_room_for_pixels(&self) -> bool {
         let pixels = self.rendering_count + self.rendered.len() + self.delivering_count;
-        self.rendering_count < TILES_AT_HAND * self.threads
-            && pixels < MOST_TILES_OF_PIXELS * self.threads
+        let turns = self.turn * self.threads;
+        self.rendering_count < TURNS_AT_HAND * turns && pixels < MOST_TURNS_OF_PIXELS * turns
     }
 
-    fn on_tile_sent(&mut self, name: LeaseName) {
+    fn on_tile_sent(&mut self, name: LeaseName, tile: TileId) {
         if let Some(held) = self.leases.get_mut(&name) {
             held.tiles_left -= 1;
+            held.begun.remove(&tile);
             if held.tiles_left == 0 {
                 self.leases.remove(&name);
             }

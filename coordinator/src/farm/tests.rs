@@ -14,10 +14,14 @@ struct World {
 
 impl World {
     fn new() -> Self {
+        Self::with_audit(0.0)
+    }
+
+    fn with_audit(fraction: f64) -> Self {
         #[expect(clippy::disallowed_methods, reason = "any instant will do")]
         let now = Instant::now();
         let identity = Identity::from_random([1; 24]);
-        Self { farm: Farm::new(identity, TERM), now, last_number: 0 }
+        Self { farm: Farm::new(identity, TERM, Audit::new(fraction, [9; 32])), now, last_number: 0 }
     }
 
     fn number(&mut self) -> u64 {
@@ -28,7 +32,7 @@ impl World {
     fn join(&mut self) -> WorkerId {
         let nonce = self.number();
         let process = Process { nonce, number: nonce as u32, threads: 1, ..Process::default() };
-        self.farm.on_join(process, self.now).0
+        self.farm.on_join(process, self.now).0.unwrap()
     }
 
     /// Orders a picture of a row of tiles; answers also with what that leads to.
@@ -102,6 +106,26 @@ impl World {
     }
 }
 
+/// What is written into the log of workers that lie and tiles that are taken back.
+fn found(actions: &[Action]) -> Vec<String> {
+    let found = |action: &Action| match action {
+        Action::Log(Notice::Liar { worker, tile, .. }) => {
+            Some(format!("{worker} lies of {}", tile.number()))
+        }
+        Action::Log(Notice::TakenBack { worker, tiles, .. }) => {
+            let tiles: Vec<u32> = tiles.iter().map(|tile| tile.number()).collect();
+            Some(format!("{tiles:?} of {worker}"))
+        }
+        Action::Log(Notice::NoAudit) => Some("no audit".to_owned()),
+        Action::Log(Notice::NotCompared(_, tile)) => {
+            Some(format!("{} is not compared", tile.number()))
+        }
+        Action::Log(Notice::JobFailed(_, reason)) => Some(reason.clone()),
+        _ => None,
+    };
+    actions.iter().filter_map(found).collect()
+}
+
 fn answers(actions: &[Action]) -> Vec<(AskId, Result<Next, NoMember>)> {
     let answer = |action: &Action| match action {
         Action::Answer(ask, answer) => Some((*ask, answer.clone())),
@@ -153,7 +177,7 @@ fn a_call_meant_for_another_incarnation_is_refused_and_counted() {
 #[test]
 fn incarnations_number_their_jobs_differently() {
     let identities = [[1; 24], [2; 24]].map(Identity::from_random);
-    let mut farms = identities.map(|identity| Farm::new(identity, TERM));
+    let mut farms = identities.map(|identity| Farm::new(identity, TERM, Audit::new(0.0, [0; 32])));
     let numbers: BTreeSet<JobId> =
         farms.iter_mut().flat_map(|farm| [farm.number_job(), farm.number_job()]).collect();
     assert_eq!(numbers.len(), 4);
@@ -313,6 +337,188 @@ fn a_worker_that_is_alone_gets_a_tile_again_of_which_it_brought_no_sense() {
 }
 
 #[test]
+fn a_third_worker_says_who_of_two_lies_and_the_liars_tiles_are_rendered_again() {
+    for liar_is_first in [true, false] {
+        let mut world = World::with_audit(1e-9);
+        let [first, second, third] = [world.join(), world.join(), world.join()];
+        world.submit(4);
+        let said = if liar_is_first { [9, 7] } else { [7, 9] };
+        // Both may be the first of their job, and the second tile of the first worker is not.
+        let run = world.lease(first);
+        world.deliver(first, &run, said[0]);
+        world.store(&run);
+        let other = world.lease(first);
+        world.deliver(first, &other, said[0]);
+        world.store(&other);
+        let again = world.lease(second);
+        assert_eq!(again.tiles, run.tiles, "to be compared");
+        let (id, actions) = world.deliver(second, &again, said[1]);
+        assert_eq!(verdicts(&actions), [(id, Verdict::Duplicate)]);
+        assert_eq!(shown(&actions).differing_tiles, 1);
+        let last = world.lease(third);
+        assert_eq!(last.tiles, run.tiles, "to be decided");
+        let (id, actions) = world.deliver(third, &last, 7);
+        let (liar, tile) = (if liar_is_first { first } else { second }, run.tiles[0].number());
+        let lies = format!("{liar} lies of {tile}");
+        if liar_is_first {
+            let both = [run.tiles[0].number(), other.tiles[0].number()];
+            assert_eq!(found(&actions), [lies, format!("{both:?} of {liar}")]);
+            assert_eq!(shown(&actions).tiles_done, 0);
+            assert!(matches!(actions.last(), Some(Action::Store(stored, ..)) if *stored == id));
+            assert_eq!(shown(&world.store(&last)).tiles_done, 1);
+            assert_eq!(world.lease(second).tiles, run.tiles, "it is the first of the third");
+            assert_eq!(world.lease(second).tiles, other.tiles, "it is free again");
+        } else {
+            assert_eq!(found(&actions), [lies]);
+            assert_eq!(verdicts(&actions), [(id, Verdict::Duplicate)]);
+        }
+        let (id, actions) = world.deliver(liar, &run, 7);
+        assert_eq!(verdicts(&actions), [(id, Verdict::Rejected)], "nobody believes it any more");
+        let process = Process { nonce: u64::from(liar.0), ..Process::default() };
+        assert_eq!(world.farm.on_join(process, world.now).0, Err(KeptOut(liar)));
+        let (ask, actions) = world.ask(liar, SECOND);
+        assert_eq!(answers(&actions), [(ask, Err(NoMember(liar)))]);
+    }
+}
+
+#[test]
+fn tiles_of_a_liar_that_are_being_stored_are_taken_back_too() {
+    let mut world = World::with_audit(1e-9);
+    let [liar, second, third] = [world.join(), world.join(), world.join()];
+    world.submit(2);
+    let run = world.lease(liar);
+    world.deliver(liar, &run, 9);
+    world.store(&run);
+    let late = world.lease(liar);
+    let (id, _) = world.deliver(liar, &late, 9);
+    for worker in [second, third] {
+        let again = world.lease(worker);
+        world.deliver(worker, &again, 7);
+    }
+    let actions = world.store(&late);
+    assert_eq!(verdicts(&actions), [(id, Verdict::Accepted)]);
+    assert_eq!(found(&actions), [format!("[{}] of {liar}", late.tiles[0].number())]);
+    assert_eq!(shown(&actions).tiles_done, 0);
+}
+
+#[test]
+fn a_tile_of_which_nobody_knows_who_is_right_fails_its_job_at_the_end() {
+    for third_says in [None, Some(8)] {
+        let mut world = World::with_audit(1e-9);
+        let [first, second] = [world.join(), world.join()];
+        world.submit(2);
+        let run = world.lease(first);
+        world.stitch(first, &run);
+        let again = world.lease(second);
+        world.deliver(second, &again, 9);
+        if let Some(hash) = third_says {
+            let third = world.join();
+            let again = world.lease(third);
+            world.deliver(third, &again, hash);
+        }
+        let last = world.lease(second);
+        let actions = world.stitch(second, &last);
+        // The other's first tile is to be compared still.
+        assert_eq!(shown(&actions).outcome, None);
+        let again = world.lease(first);
+        let (_, actions) = world.deliver(first, &again, 7);
+        let tile = run.tiles[0].number();
+        let reason = format!(
+            "1 of 2 tiles are right; rendered differently, and nobody knows who is right: {tile}"
+        );
+        assert_eq!(shown(&actions).outcome, Some(Outcome::Failed(reason)));
+    }
+}
+
+#[test]
+fn a_worker_that_is_alone_is_compared_with_nobody_which_is_said_once() {
+    let mut world = World::with_audit(1.0);
+    let worker = world.join();
+    for expected in [vec!["no audit".to_owned()], Vec::new()] {
+        world.submit(1);
+        let run = world.lease(worker);
+        let actions = world.stitch(worker, &run);
+        assert_eq!(found(&actions), expected);
+        assert!(matches!(shown(&actions).outcome, Some(Outcome::Finished(_))));
+    }
+}
+
+#[test]
+fn a_job_does_not_wait_for_a_comparison_that_does_not_come() {
+    for is_stopped in [true, false] {
+        let mut world = World::with_audit(1.0);
+        let (worker, other) = (world.join(), world.join());
+        world.submit(1);
+        let run = world.lease(worker);
+        assert_eq!(found(&world.stitch(worker, &run)), [""; 0]);
+        let start = world.now;
+        loop {
+            let wake = world.farm.next_wake().unwrap();
+            let mut actions = world.pass(wake - world.now);
+            if !is_stopped && world.farm.members.contains(other) {
+                // It has something else to do.
+                world.farm.on_renew(other, &[], world.now).unwrap();
+            }
+            actions.retain(|action| matches!(action, Action::Publish(..)));
+            if !actions.is_empty() {
+                break;
+            }
+        }
+        let waited = world.now - start;
+        let most = if is_stopped { 3 * TERM } else { LONGEST_SILENCE + TERM };
+        assert!((most / 2..=most).contains(&waited), "{waited:?}");
+    }
+}
+
+#[test]
+fn a_tile_of_which_workers_that_compare_it_are_lost_is_not_compared_which_is_said() {
+    let mut world = World::with_audit(1.0);
+    let worker = world.join();
+    let others = [(); 3].map(|()| (world.join(), world.last_number as u32));
+    world.submit(1);
+    let run = world.lease(worker);
+    let mut told = found(&world.stitch(worker, &run));
+    for (other, process) in others {
+        assert_eq!(world.lease(other).tiles, run.tiles, "it compares");
+        told.extend(found(&world.farm.on_process_exit(process, "killed by signal 11", world.now)));
+    }
+    assert_eq!(told, [format!("{} is not compared", run.tiles[0].number())]);
+}
+
+#[test]
+fn a_tile_that_kills_its_workers_is_set_aside_and_the_others_are_finished() {
+    let mut world = World::new();
+    world.submit(3);
+    let mut killer = None;
+    for lost in 0..3 {
+        let worker = world.join();
+        let process = world.last_number as u32;
+        let run = world.lease(worker);
+        let tile = *killer.get_or_insert(run.tiles[0]);
+        assert_eq!(run.tiles[0], tile, "it goes first to a worker that has nothing else");
+        let (ask, actions) = world.ask(worker, SECOND);
+        assert_eq!(actions.is_empty(), lost > 0, "a suspect is alone");
+        world.farm.on_hang_up(ask);
+        world.farm.on_process_exit(process, "killed by signal 11", world.now);
+    }
+    let worker = world.join();
+    for _ in 0..2 {
+        let run = world.lease(worker);
+        assert_ne!(Some(run.tiles[0]), killer);
+        let actions = world.stitch(worker, &run);
+        if shown(&actions).tiles_done == 2 {
+            let tile = killer.unwrap().number();
+            let reason = format!(
+                "2 of 3 tiles are right; set aside, since 3 workers were lost with each or stood \
+                 still: {tile}"
+            );
+            assert_eq!(shown(&actions).outcome, Some(Outcome::Failed(reason)));
+        }
+    }
+    assert!(world.farm.ended.len() == 1);
+}
+
+#[test]
 fn an_overdue_tile_is_rendered_again_before_a_later_job() {
     let mut world = World::new();
     let (stuck, idle) = (world.join(), world.join());
@@ -467,10 +673,8 @@ fn a_cancelled_job_fails_for_those_who_watch_and_is_forgotten() {
     assert_eq!(verdicts(&actions), [(delivery, Verdict::Rejected)]);
     assert_eq!(forgotten(&actions), [job]);
     assert!(world.store(&run).is_empty(), "nobody wants it any more");
-    assert_eq!(
-        world.farm.on_renew(worker, &[Renewal { lease: run.lease, work: 1 }], world.now),
-        Ok(vec![run.lease])
-    );
+    let renewal = Renewal { lease: run.lease, work: 1, tiles: Vec::new() };
+    assert_eq!(world.farm.on_renew(worker, &[renewal], world.now), Ok(vec![run.lease]));
     assert!(world.farm.on_cancel(job).is_empty(), "there is no such job");
 }
 
@@ -528,4 +732,69 @@ fn a_farm_that_shuts_down_ends_every_job_and_stops_with_the_last_worker() {
         assert!(matches!(actions.last(), Some(Action::Stop)), "{actions:?}");
         assert_eq!(shown(&world.submit(1).1).outcome, Some(stopped), "it comes too late");
     }
+}
+
+#[test]
+fn tiles_that_a_worker_kept_are_leased_to_it_if_they_are_free() {
+    let mut world = World::new();
+    let (kept, other) = (world.join(), world.join());
+    let (job, _) = world.submit(20);
+    let taken = world.lease(other);
+    let grid = world.farm.leases.tiles(job).unwrap().grid();
+    let free = (0..20).find(|&number| !taken.tiles.contains(&grid.tile(number).unwrap())).unwrap();
+    let numbers = [taken.tiles[0].number(), free, 99];
+    let mut offer = |worker, job| {
+        let run = world.farm.on_offer(worker, job, &numbers, world.now);
+        world.farm.check();
+        run
+    };
+    assert_eq!(offer(WorkerId(77), job), None, "nobody knows it");
+    assert_eq!(offer(kept, JobId(7)), None, "there is no such job");
+    let run = offer(kept, job).expect("one of them is free");
+    assert_eq!(run.tiles, [grid.tile(free).unwrap()]);
+    assert_eq!(offer(kept, job), None, "none is free now");
+    let actions = world.stitch(kept, &run);
+    assert!(matches!(verdicts(&actions)[..], [(_, Verdict::Accepted)]), "{actions:?}");
+}
+
+#[test]
+fn a_farm_that_keeps_its_jobs_goes_on_with_them() {
+    let mut world = World::new();
+    let identity = Identity::from_random([2; 24]);
+    world.farm = Farm::keeping_jobs(identity, TERM, Audit::new(0.0, [7; 32]), JobId(5));
+    let grid = TileGrid::new(Size::new(64, 16).unwrap(), 16).unwrap();
+    let done = |numbers: &[u32]| {
+        let mut tiles = Tiles::new(grid);
+        for &number in numbers {
+            tiles.set_done(grid.tile(number).unwrap(), [7; 32]);
+        }
+        tiles
+    };
+    let earlier = Earlier {
+        elapsed: 9 * SECOND,
+        tally: Tally { rays: 30, ..Tally::default() },
+        worker_count: 2,
+    };
+    let actions = world.farm.on_order(JobId(3), done(&[0, 1, 3]), earlier.clone(), world.now);
+    world.farm.check();
+    assert_eq!((shown(&actions).tiles_done, shown(&actions).tally.rays), (3, 30));
+    let worker = world.join();
+    let run = world.lease(worker);
+    assert_eq!(run.tiles, [grid.tile(2).unwrap()]);
+    world.now += SECOND;
+    let progress = shown(&world.stitch(worker, &run));
+    assert_eq!(progress.outcome, Some(Outcome::Finished(10 * SECOND)));
+    assert_eq!((progress.tally.rays, progress.worker_count), (40, 2));
+
+    let whole = world.farm.on_order(JobId(4), done(&[0, 1, 2, 3]), earlier, world.now);
+    world.farm.check();
+    assert_eq!(shown(&whole).outcome, Some(Outcome::Finished(9 * SECOND)));
+    assert_eq!(world.farm.number_job(), JobId(6));
+    let actions = world.farm.on_kept(JobId(1), progress, world.now);
+    world.farm.check();
+    assert!(shown(&actions).outcome.is_some());
+    let (job, _) = world.submit(2);
+    let actions = world.farm.on_shut_down(world.now);
+    assert!(!actions.iter().any(|action| matches!(action, Action::Publish(..))), "{actions:?}");
+    assert!(world.farm.tile(job, 0).is_some(), "it goes on later");
 }

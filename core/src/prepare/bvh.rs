@@ -71,19 +71,22 @@ struct BuildRange<'a> {
     bounds: Bounds,
     /// The bounds of twice the centres.
     centers: Bounds,
+    /// Items from this number on have a leaf each.
+    alone_from: u32,
 }
 
 /// Builds the hierarchy over `primitives` and brings them into the order in which leaves name them.
-/// The root is node 0; every other node stands after its parent.
-pub(super) fn build_bvh(primitives: &mut [BuildPrimitive]) -> Vec<Node> {
+/// Items from the number `alone_from` on, which are costly to meet, have a leaf each. The root is
+/// node 0; every other node stands after its parent.
+pub(super) fn build_bvh(primitives: &mut [BuildPrimitive], alone_from: u32) -> Vec<Node> {
     if primitives.is_empty() {
         return vec![Node::EMPTY];
     }
-    build_node(BuildRange::new(primitives, 0), 0)
+    build_node(BuildRange::new(primitives, 0, alone_from), 0)
 }
 
 impl<'a> BuildRange<'a> {
-    fn new(primitives: &'a mut [BuildPrimitive], first: usize) -> Self {
+    fn new(primitives: &'a mut [BuildPrimitive], first: usize, alone_from: u32) -> Self {
         let measure = |chunk: &[BuildPrimitive]| {
             chunk.iter().fold((Bounds::NONE, Bounds::NONE), |(bounds, centers), primitive| {
                 let middle = [0, 1, 2].map(|axis| primitive.bounds.twice_center(axis));
@@ -99,7 +102,7 @@ impl<'a> BuildRange<'a> {
         } else {
             measure(primitives)
         };
-        Self { primitives, first, bounds, centers }
+        Self { primitives, first, bounds, centers, alone_from }
     }
 
     /// Splits in two where it is cheapest.
@@ -110,11 +113,14 @@ impl<'a> BuildRange<'a> {
             None => self.primitives.len() / 2, // Nothing tells them apart.
         };
         let (left, right) = self.primitives.split_at_mut(at);
-        [BuildRange::new(left, self.first), BuildRange::new(right, self.first + at)]
+        let range = |half, first| BuildRange::new(half, first, self.alone_from);
+        [range(left, self.first), range(right, self.first + at)]
     }
 
     fn is_leaf(&self) -> bool {
-        self.primitives.len() <= LEAF
+        let is_alone = |primitive: &BuildPrimitive| primitive.item >= self.alone_from;
+        self.primitives.len() == 1
+            || self.primitives.len() <= LEAF && !self.primitives.iter().any(is_alone)
     }
 
     /// The split between two bins with the least area x count on its sides; `None` where the
@@ -293,7 +299,7 @@ mod tests {
                 item: item as u32,
             })
             .collect();
-        let nodes = build_bvh(&mut primitives);
+        let nodes = build_bvh(&mut primitives, u32::MAX);
         let mut seen = vec![0; boxes.len()];
         let mut levels = vec![1; nodes.len()];
         for (index, node) in nodes.iter().enumerate() {
@@ -403,7 +409,7 @@ mod tests {
                 let middle = |primitive: &BuildPrimitive| primitive.bounds.twice_center(axis);
                 range.primitives.sort_by(|a, b| middle(a).total_cmp(&middle(b)));
                 let (left, right) = range.primitives.split_at_mut(at);
-                [BuildRange::new(left, 0), BuildRange::new(right, 0)]
+                [left, right].map(|half| BuildRange::new(half, 0, u32::MAX))
             }
         };
         area + halves.into_iter().map(|half| cost(half, splitter, root_area)).sum::<f64>()
@@ -422,7 +428,7 @@ mod tests {
             .collect();
         let cost_of = |splitter| {
             let mut primitives = primitives.clone();
-            let range = BuildRange::new(&mut primitives, 0);
+            let range = BuildRange::new(&mut primitives, 0, u32::MAX);
             let area = f64::from(range.bounds.half_area());
             cost(range, splitter, area)
         };

@@ -4,7 +4,10 @@ use std::ops::Range;
 
 use glam::DVec3;
 
-use super::parallelepiped::{box_edges, box_faces};
+use super::{
+    newell::unit_normal,
+    parallelepiped::{box_edges, box_faces},
+};
 use crate::scene::Parallelepiped;
 
 /// The flat faces of a scene, numbered in this order: triangles, quadrangles, then the faces of the
@@ -70,6 +73,17 @@ impl FlatFaces {
         } else {
             let first = 3 * self.triangle_count + 4 * (face - self.triangle_count);
             first..first + 4
+        }
+    }
+
+    /// The unit normal of a face.
+    pub(super) fn normal(&self, face: usize) -> DVec3 {
+        match face.checked_sub(self.count() - self.box_edges.len()) {
+            Some(of_box) => {
+                let [u, v] = self.box_edges[of_box];
+                unit_normal(&[DVec3::ZERO, u, v])
+            }
+            None => unit_normal(self.corners_of(face)),
         }
     }
 

@@ -28,7 +28,8 @@ impl Hierarchy {
     pub(crate) fn new(surfaces: &Surfaces) -> Self {
         let frame = frame_around(surfaces);
         let mut primitives = build_primitives(surfaces, &frame);
-        let nodes = build_bvh(&mut primitives);
+        let first_solid = surfaces.flat.item_count() + surfaces.spheres.len();
+        let nodes = build_bvh(&mut primitives, first_solid as u32);
         let order = primitives.into_iter().map(|primitive| primitive.item).collect();
         Self { frame, nodes, order }
     }

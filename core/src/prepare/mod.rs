@@ -16,6 +16,7 @@ mod flat;
 mod hierarchy;
 mod lights;
 pub(crate) mod mip_maps;
+mod near_planes;
 mod newell;
 mod parallelepiped;
 mod place;
@@ -23,6 +24,7 @@ mod plane_fingerprint;
 mod planes;
 mod ranks;
 mod scale;
+mod solid_boxes;
 mod solid_trees;
 mod sort;
 mod surfaces;
@@ -63,7 +65,7 @@ pub fn prepare_with(
 
     let scaled = Collected::new(scene, &ranks).scale(extent_of_eye_and_lights(scene, &viewport));
     let scale = scaled.scale;
-    let surfaces = scaled.weld().share_surfaces();
+    let surfaces = scaled.weld().share_surfaces(&ranks);
     let Hierarchy { frame, nodes, order } = Hierarchy::new(&surfaces);
     let mut faces = surfaces.sort(&order);
     drop(order);
@@ -99,6 +101,7 @@ pub fn prepare_with(
         solids: &faces.solids,
         solid_nodes: &faces.solid_nodes,
         leaves: &faces.leaves,
+        solid_boxes: &faces.solid_boxes,
         first_ranks: &ranks.firsts,
         emitters: &emitters.records,
         emitter_nodes: &emitters.nodes,

@@ -1,13 +1,16 @@
-//! Which flat faces lie in one plane, exactly.
+//! Which flat faces lie in one plane.
 //!
 //! Coincident faces must be met at one distance, and a ray that leaves a face must not meet
-//! another that lies on it. So faces in exactly the same plane share one plane record. Real
-//! scenes hold thousands of copies of one triangle, and labels that lie in a wall.
+//! another that lies on it. So faces in the same plane, exactly or as far as rounding can tell, share
+//! one plane record. Real scenes hold thousands of copies of one triangle, and labels that lie in a
+//! wall.
 
 use glam::DVec3;
 use rayon::prelude::*;
 
-use super::{flat::FlatFaces, newell::unit_normal, plane_fingerprint::plane_fingerprints};
+use super::{
+    flat::FlatFaces, near_planes::near_sets, plane_fingerprint::plane_fingerprints, ranks::Ranks,
+};
 use crate::{
     exact::predicates::is_coplanar,
     prepared::record::{PlaneIndex, PlaneRecord},
@@ -24,12 +27,13 @@ pub(super) struct SharedPlanes {
     pub(super) planes: Vec<PlaneRecord>,
 }
 
-/// Gives flat faces in exactly one plane one record, that of the face that comes first.
-/// `first_corners` has for each corner the first one in the same place.
-pub(super) fn share_planes(flat: &FlatFaces, first_corners: &[u32]) -> SharedPlanes {
+/// Gives flat faces in one plane one record: that of the face that comes first where the plane is
+/// exactly one, that of the largest where it is one within rounding. `first_corners` has for each corner the first one in the same place.
+pub(super) fn share_planes(flat: &FlatFaces, ranks: &Ranks, first_corners: &[u32]) -> SharedPlanes {
     let mut sharing = Sharing { flat, of_faces: vec![None; flat.count()], planes: Vec::new() };
     sharing.share_exact_planes();
     sharing.share_outlines(first_corners);
+    sharing.share_near_planes(ranks);
     let Sharing { of_faces: mut of_triangles, planes, .. } = sharing;
     let every = |faces: Vec<Option<PlaneIndex>>| -> Vec<PlaneIndex> {
         faces.into_iter().map(|plane| plane.expect("every quadrangle is in a group")).collect()
@@ -97,13 +101,38 @@ impl Sharing<'_> {
         }
     }
 
-    /// Gives faces, in the order of their ranks, the first one's plane.
+    /// Gives faces in planes that rounding cannot tell apart one record.
+    fn share_near_planes(&mut self, ranks: &Ranks) {
+        let exact = |face: usize| self.of_faces[face].map(PlaneIndex::index);
+        let sets = near_sets(self.flat, ranks, exact);
+        for set in &sets {
+            self.share(set.iter().copied());
+        }
+        if !sets.is_empty() {
+            self.drop_unused_planes();
+        }
+    }
+
+    fn drop_unused_planes(&mut self) {
+        let mut places = vec![None; self.planes.len()];
+        let mut used = Vec::new();
+        for index in self.of_faces.iter_mut().flatten() {
+            let place = *places[index.index()].get_or_insert_with(|| {
+                used.push(self.planes[index.index()]);
+                used.len() - 1
+            });
+            *index = PlaneIndex::new(place, index.sign() < 0.0);
+        }
+        self.planes = used;
+    }
+
+    /// Gives faces the first one's plane.
     fn share(&mut self, group: impl Iterator<Item = usize>) {
         let mut group = group.peekable();
         let plane = plane_of(self.flat, *group.peek().expect("a group has a face"));
         let index = self.planes.len();
         for face in group {
-            let is_reversed = normal_of(self.flat, face).dot(DVec3::from_array(plane.normal)) < 0.0;
+            let is_reversed = self.flat.normal(face).dot(DVec3::from_array(plane.normal)) < 0.0;
             self.of_faces[face] = Some(PlaneIndex::new(index, is_reversed));
         }
         self.planes.push(plane);
@@ -120,16 +149,5 @@ fn plane_of(flat: &FlatFaces, face: usize) -> PlaneRecord {
         let from_first: DVec3 = corners.iter().map(|&corner| corner - corners[0]).sum();
         corners[0] + from_first / corners.len() as f64
     };
-    PlaneRecord { point: point.to_array(), normal: normal_of(flat, face).to_array() }
-}
-
-/// The unit normal of a flat face.
-fn normal_of(flat: &FlatFaces, face: usize) -> DVec3 {
-    match face.checked_sub(flat.count() - flat.box_edges.len()) {
-        Some(of_box) => {
-            let [u, v] = flat.box_edges[of_box];
-            unit_normal(&[DVec3::ZERO, u, v])
-        }
-        None => unit_normal(flat.corners_of(face)),
-    }
+    PlaneRecord { point: point.to_array(), normal: flat.normal(face).to_array() }
 }

@@ -51,6 +51,14 @@ impl Ranks {
         Ok(Self { firsts })
     }
 
+    /// The primitive that has the face of a rank.
+    pub(super) fn primitive(&self, rank: u32) -> u32 {
+        match self.firsts.partition_point(|&first| first <= rank) {
+            0 => rank,
+            after => after as u32 - 1,
+        }
+    }
+
     /// The rank of a primitive's first face.
     pub(super) fn first(&self, primitive: u32) -> u32 {
         self.firsts.get(primitive as usize).copied().unwrap_or(primitive)

@@ -7,6 +7,7 @@ use crate::{
     prepared::{
         face::Part,
         record::{NO_NODE, SolidNodeKind, SolidNodeRecord, SolidRecord},
+        solid_tree::link_solid,
     },
     scene::{Operation, Solid, SolidNode},
 };
@@ -49,44 +50,25 @@ impl SolidTrees {
     /// Adds a solid whose first face has `rank`; the faces of its parallelepipeds go to `flat`.
     pub(super) fn push(&mut self, solid: &Solid, rank: u32, flat: &mut FlatFaces) {
         let (first_node, first_leaf) = (self.nodes.len(), self.leaves.len());
-        // The nodes and bounds of what waits to be an operand.
-        let mut waiting: Vec<(u32, (DVec3, DVec3))> = Vec::new();
-        let mut leaf_count = 0;
-        for (index, node) in (0..).zip(&solid.nodes) {
-            let (kind, operands, bounds) = match node {
+        let shape = solid.nodes.iter().map(|node| match node {
+            SolidNode::Operation { operation, operands } => (kind_of(*operation), *operands),
+            _ => (SolidNodeKind::LEAF, 0),
+        });
+        self.nodes.extend(link_solid(shape).expect("a solid is a tree"));
+        let mut leaf_bounds = Vec::new();
+        for node in &solid.nodes {
+            leaf_bounds.push(match node {
                 SolidNode::Sphere(sphere) => {
-                    let bounds = (sphere.center - sphere.radius, sphere.center + sphere.radius);
-                    (SolidNodeKind::LEAF, Vec::new(), bounds)
+                    (sphere.center - sphere.radius, sphere.center + sphere.radius)
                 }
                 SolidNode::Parallelepiped(solid) => {
-                    let first_rank = rank + Part::FACES * leaf_count;
-                    let faces = flat.push_box(solid, first_rank);
-                    (SolidNodeKind::LEAF, Vec::new(), bounds_of(faces.as_flattened()))
+                    let first_rank = rank + Part::FACES * leaf_bounds.len() as u32;
+                    bounds_of(flat.push_box(solid, first_rank).as_flattened())
                 }
-                SolidNode::Operation { operation, operands } => {
-                    let operands = waiting.split_off(waiting.len() - *operands as usize);
-                    let bounds = join_bounds(*operation, operands.iter().map(|&(_, b)| b));
-                    (kind_of(*operation), operands, bounds)
-                }
-            };
-            for (k, &(child, _)) in operands.iter().enumerate() {
-                let next = operands.get(k + 1).map_or(NO_NODE, |next| next.0);
-                let child = &mut self.nodes[first_node + child as usize];
-                (child.parent, child.next) = (index, next);
-                child.is_first = u32::from(k == 0);
-            }
-            self.nodes.push(SolidNodeRecord {
-                kind,
-                parent: NO_NODE,
-                first_child: operands.first().map_or(leaf_count, |first| first.0),
-                next: NO_NODE,
-                operands: operands.len() as u32,
-                is_first: 0,
+                SolidNode::Operation { .. } => continue,
             });
-            leaf_count += u32::from(kind == SolidNodeKind::LEAF);
-            waiting.push((index, bounds));
         }
-        let (_, bounds) = waiting.pop().expect("a root");
+        let bounds = *node_bounds(&self.nodes[first_node..], &leaf_bounds).last().expect("a root");
         let is_reversed = reversed_nodes(&self.nodes[first_node..]);
         for ((index, node), is_reversed) in (0..).zip(&solid.nodes).zip(is_reversed) {
             let (center, radius, material) = match node {
@@ -110,27 +92,37 @@ fn kind_of(operation: Operation) -> SolidNodeKind {
     }
 }
 
-/// A box around what an operation makes of operands in these boxes.
-fn join_bounds(
-    operation: Operation,
-    mut operands: impl Iterator<Item = (DVec3, DVec3)>,
-) -> (DVec3, DVec3) {
-    match operation {
-        Operation::Union => operands.reduce(|a, b| (a.0.min(b.0), a.1.max(b.1))),
-        Operation::Intersection => operands.reduce(|a, b| (a.0.max(b.0), a.1.min(b.1))),
-        Operation::Difference => operands.next(),
+/// A box around what each node of a solid makes of leaves in these boxes.
+pub(super) fn node_bounds(
+    nodes: &[SolidNodeRecord],
+    leaf_bounds: &[(DVec3, DVec3)],
+) -> Vec<(DVec3, DVec3)> {
+    let mut bounds: Vec<(DVec3, DVec3)> = Vec::with_capacity(nodes.len());
+    let mut waiting = Vec::new();
+    for (index, node) in nodes.iter().enumerate() {
+        let operands = waiting.split_off(waiting.len() - node.operands as usize);
+        let operands = operands.into_iter().map(|child: usize| bounds[child]);
+        let joined = match node.kind {
+            SolidNodeKind::LEAF => Some(leaf_bounds[node.first_child as usize]),
+            SolidNodeKind::UNION => operands.reduce(|a, b| (a.0.min(b.0), a.1.max(b.1))),
+            SolidNodeKind::INTERSECTION => operands.reduce(|a, b| (a.0.max(b.0), a.1.min(b.1))),
+            _ => Some(bounds[node.first_child as usize]),
+        };
+        bounds.push(joined.expect("two operands or more"));
+        waiting.push(index);
     }
-    .expect("two operands or more")
+    bounds
 }
 
 /// For each node of a solid, whether an odd number of differences takes it away.
 fn reversed_nodes(nodes: &[SolidNodeRecord]) -> Vec<bool> {
     let mut is_reversed = vec![false; nodes.len()];
     for index in (0..nodes.len()).rev() {
-        let SolidNodeRecord { parent, is_first, .. } = nodes[index];
+        let parent = nodes[index].parent;
         if parent != NO_NODE {
+            let above = &nodes[parent as usize];
             let is_taken =
-                nodes[parent as usize].kind == SolidNodeKind::DIFFERENCE && is_first == 0;
+                above.kind == SolidNodeKind::DIFFERENCE && above.first_child as usize != index;
             is_reversed[index] = is_reversed[parent as usize] ^ is_taken;
         }
     }

@@ -3,9 +3,12 @@
 use glam::DVec3;
 
 use super::{flat::FaceAttributes, surfaces::Surfaces};
-use crate::prepared::record::{
-    CoplanarRecord, Item, Kind, LeafRecord, PlaneRecord, QuadrangleRecord, SolidNodeRecord,
-    SolidRecord, SphereRecord, TriangleRecord,
+use crate::prepared::{
+    node::Node,
+    record::{
+        CoplanarRecord, Item, Kind, LeafRecord, PlaneRecord, QuadrangleRecord, SolidNodeRecord,
+        SolidRecord, SphereRecord, TriangleRecord,
+    },
 };
 
 /// The records of all faces. Those of each kind stand in the order of the hierarchy's leaves, and
@@ -21,6 +24,7 @@ pub(super) struct Sorted {
     pub(super) solids: Vec<SolidRecord>,
     pub(super) solid_nodes: Vec<SolidNodeRecord>,
     pub(super) leaves: Vec<LeafRecord>,
+    pub(super) solid_boxes: Vec<Node>,
     /// The same solids in file order.
     pub(super) solids_in_file_order: Vec<SolidRecord>,
     /// A box around each of those, as its least and its greatest corner.
@@ -89,6 +93,7 @@ impl Surfaces {
             solids,
             solid_nodes: self.solid_nodes,
             leaves: self.leaves,
+            solid_boxes: self.solid_boxes,
             solids_in_file_order,
             solid_bounds: self.solid_bounds,
             box_corners,

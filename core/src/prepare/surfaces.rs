@@ -2,13 +2,16 @@
 
 use super::{
     equal_spheres::share_spheres,
-    flat::FlatFaces,
+    flat::{FlatFaces, bounds_of},
     planes::{SharedPlanes, share_planes},
-    solid_trees::SolidTrees,
+    ranks::Ranks,
+    solid_boxes::enclose_leaves,
+    solid_trees::{Leaf, SolidTrees},
     weld::Welded,
 };
-use crate::prepared::record::{
-    LeafRecord, PlaneIndex, PlaneRecord, SolidNodeRecord, SolidRecord, SphereRecord,
+use crate::prepared::{
+    node::Node,
+    record::{LeafRecord, PlaneIndex, PlaneRecord, SolidNodeRecord, SolidRecord, SphereRecord},
 };
 use glam::DVec3;
 
@@ -28,21 +31,25 @@ pub(super) struct Surfaces {
     pub(super) solid_bounds: Vec<(DVec3, DVec3)>,
     pub(super) solid_nodes: Vec<SolidNodeRecord>,
     pub(super) leaves: Vec<LeafRecord>,
+    /// The hierarchies over the leaves of each solid.
+    pub(super) solid_boxes: Vec<Node>,
 }
 
 impl Welded {
     /// Finds the surfaces that faces share.
-    pub(super) fn share_surfaces(self) -> Surfaces {
+    pub(super) fn share_surfaces(self, ranks: &Ranks) -> Surfaces {
         let Self { flat, mut spheres, solids, first_corners } = self;
         let SharedPlanes { of_triangles, of_quadrangles, of_boxes, planes } =
-            share_planes(&flat, &first_corners);
+            share_planes(&flat, ranks, &first_corners);
         let sphere_surfaces = share_spheres(&mut spheres, &solids);
-        let SolidTrees { solids, bounds, nodes, leaves } = solids;
+        let SolidTrees { mut solids, bounds, nodes, leaves } = solids;
+        let leaf_bounds = leaf_bounds(&leaves, &flat);
         let mut of_boxes = of_boxes.into_iter();
         let leaves = leaves
             .into_iter()
             .zip(sphere_surfaces)
-            .map(|(leaf, surface)| LeafRecord {
+            .zip(&leaf_bounds)
+            .map(|((leaf, surface), (min, max))| LeafRecord {
                 center: leaf.center.to_array(),
                 radius: leaf.radius,
                 planes: if leaf.is_box() {
@@ -54,8 +61,16 @@ impl Welded {
                 node: leaf.node,
                 is_reversed: u32::from(leaf.is_reversed),
                 surface,
+                // All of it is in the box, and 4 ulp more are enough for the length's rounding.
+                extent: 2.0 * min.abs().max(max.abs()).length() * (1.0 + 4.0 * f64::EPSILON),
             })
-            .collect();
+            .collect::<Vec<_>>();
+        let mut solid_boxes = Vec::new();
+        for solid in &mut solids {
+            let nodes = &nodes[solid.nodes()];
+            let (leaves, bounds) = (&leaves[solid.leaves()], &leaf_bounds[solid.leaves()]);
+            enclose_leaves(solid, nodes, leaves, bounds, &mut solid_boxes);
+        }
         Surfaces {
             flat,
             first_corners,
@@ -67,6 +82,20 @@ impl Welded {
             solid_bounds: bounds,
             solid_nodes: nodes,
             leaves,
+            solid_boxes,
         }
     }
+}
+
+/// A box around each leaf of a solid.
+fn leaf_bounds(leaves: &[Leaf], flat: &FlatFaces) -> Vec<(DVec3, DVec3)> {
+    let mut box_corners = flat.corners[flat.item_corner_count()..].chunks(6 * 4);
+    let mut bounds = |leaf: &Leaf| {
+        if leaf.is_box() {
+            bounds_of(box_corners.next().expect("as many as there are boxes among the leaves"))
+        } else {
+            (leaf.center - leaf.radius, leaf.center + leaf.radius)
+        }
+    };
+    leaves.iter().map(&mut bounds).collect()
 }

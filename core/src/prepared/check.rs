@@ -7,6 +7,7 @@ use super::{
         EmitterNode, EmitterRecord, Kind, LeafRecord, MaterialRecord, NO_NODE, PlaneIndex,
         SolidNodeKind, SolidNodeRecord, TexturedFace,
     },
+    solid_tree::link_solid,
 };
 
 /// Checks everything that readers rely on; the error names what is wrong.
@@ -25,30 +26,7 @@ pub(super) fn check(view: &View<'_>) -> Result<(), &'static str> {
     ensure(is_scale(header.scale) && is_scale(header.frame.scale), "a scale")?;
     ensure(finite(&header.frame.origin), "the frame")?;
 
-    let mut levels = vec![0_u8; view.nodes.len()];
-    *levels.get_mut(Node::ROOT).ok_or("no root")? = 1;
-    for (index, node) in view.nodes.iter().enumerate() {
-        ensure(levels[index] > 0, "a node without a parent")?;
-        ensure(node.planes.as_flattened().iter().all(|x| !x.is_nan()), "a box")?;
-        for (k, &child) in node.children.iter().enumerate() {
-            if child == Child::NONE {
-                // Its box is what keeps rays from going there, to the root again.
-                let is_empty = |side: usize| node.planes[side][k] == Node::EMPTY.planes[side][k];
-                ensure((0..6).all(is_empty), "a box")?;
-                continue;
-            }
-            if child.is_leaf() {
-                ensure(child.items().end <= view.items.len(), "a leaf")?;
-                continue;
-            }
-            let below = levels[index] + 1;
-            let level = levels.get_mut(child.node()).ok_or("a child")?;
-            // One parent each, standing before it: no loops, and no node is visited twice.
-            ensure(*level == 0 && child.node() > index, "a child")?;
-            ensure(usize::from(below) <= MOST_LEVELS, "too many levels")?;
-            *level = below;
-        }
-    }
+    check_hierarchies(view.nodes, [(Node::ROOT, view.items.len())])?;
     for item in view.items {
         let count = match item.kind().ok_or("an item")? {
             Kind::Triangle => view.triangles.len(),
@@ -92,7 +70,8 @@ pub(super) fn check(view: &View<'_>) -> Result<(), &'static str> {
     for leaf in view.leaves {
         let whole = finite(&leaf.center) && finite(&[leaf.radius]) && material(leaf.material);
         let is_shape = leaf.is_sphere() || leaf.planes.iter().all(|&index| plane(index));
-        ensure(whole && is_shape, "a leaf")?;
+        let has_extent = finite(&[leaf.extent]) && leaf.extent > 0.0;
+        ensure(whole && is_shape && has_extent, "a leaf")?;
     }
     for solid in view.solids {
         ensure(solid.nodes().end <= view.solid_nodes.len(), "a solid")?;
@@ -101,7 +80,11 @@ pub(super) fn check(view: &View<'_>) -> Result<(), &'static str> {
         check_solid_tree(view.solid_nodes(solid), leaves).map_err(|()| "a solid's tree")?;
         let last_rank = u64::from(solid.rank) + 6 * leaves.len() as u64;
         ensure(last_rank <= Child::ITEM_LIMIT as u64, "a solid")?;
+        let is_framed = is_scale(solid.frame.scale) && finite(&solid.frame.origin);
+        ensure(is_framed && finite(&[solid.margin]) && solid.margin > 0.0, "a solid's frame")?;
     }
+    let roots = view.solids.iter().map(|solid| (solid.first_box as usize, solid.leaves().len()));
+    check_hierarchies(view.solid_boxes, roots)?;
     for light in view.lights {
         let is_finite = light.intensity.iter().all(|channel| channel.is_finite());
         ensure(finite(&light.position) && is_finite, "a light")?;
@@ -110,6 +93,43 @@ pub(super) fn check(view: &View<'_>) -> Result<(), &'static str> {
     }
     check_textures(view)?;
     check_emitters(view)
+}
+
+/// Checks that nodes are trees with these roots, whose leaves name items below a number.
+fn check_hierarchies(
+    nodes: &[Node],
+    roots: impl IntoIterator<Item = (usize, usize)>,
+) -> Result<(), &'static str> {
+    let ensure = |holds: bool, what: &'static str| if holds { Ok(()) } else { Err(what) };
+    let mut known = vec![(0_u8, 0); nodes.len()];
+    for (root, limit) in roots {
+        let known = known.get_mut(root).ok_or("no root")?;
+        ensure(known.0 == 0, "two roots in one place")?;
+        *known = (1, limit);
+    }
+    for (index, node) in nodes.iter().enumerate() {
+        let (level, limit) = known[index];
+        ensure(level > 0, "a node without a parent")?;
+        ensure(node.planes.as_flattened().iter().all(|x| !x.is_nan()), "a box")?;
+        for (k, &child) in node.children.iter().enumerate() {
+            if child == Child::NONE {
+                // Its box is what keeps rays from going there, to the root again.
+                let is_empty = |side: usize| node.planes[side][k] == Node::EMPTY.planes[side][k];
+                ensure((0..6).all(is_empty), "a box")?;
+                continue;
+            }
+            if child.is_leaf() {
+                ensure(child.items().end <= limit, "a leaf")?;
+                continue;
+            }
+            let child_known = known.get_mut(child.node()).ok_or("a child")?;
+            // One parent each, standing before it: no loops, and no node is visited twice.
+            ensure(child_known.0 == 0 && child.node() > index, "a child")?;
+            ensure(usize::from(level) < MOST_LEVELS, "too many levels")?;
+            *child_known = (level + 1, limit);
+        }
+    }
+    Ok(())
 }
 
 /// Checks what readers of textures rely on.
@@ -155,31 +175,19 @@ fn check_emitters(view: &View<'_>) -> Result<(), &'static str> {
     check_emitter_tree(view.emitter_nodes, view.emitters).map_err(|()| "the tree of emitters")
 }
 
-/// Checks that nodes are a tree over these leaves in postfix order, so that walking it ends.
+/// Checks that nodes are a tree over these leaves in postfix order and linked as they should be, so
+/// that walking it ends.
 fn check_solid_tree(nodes: &[SolidNodeRecord], leaves: &[LeafRecord]) -> Result<(), ()> {
     let ensure = |holds: bool| if holds { Ok(()) } else { Err(()) };
-    ensure(nodes.last().is_some_and(|root| root.parent == NO_NODE))?;
-    let mut owners = vec![NO_NODE; nodes.len()];
-    let mut is_taken = vec![false; leaves.len()];
+    let links = link_solid(nodes.iter().map(|node| (node.kind, node.operands))).ok_or(())?;
+    ensure(links == nodes)?;
+    let mut leaves = leaves.iter();
     for (index, node) in (0..).zip(nodes) {
         if node.kind == SolidNodeKind::LEAF {
-            let leaf = leaves.get(node.first_child as usize).ok_or(())?;
-            let is_free = !std::mem::replace(&mut is_taken[node.first_child as usize], true);
-            ensure(is_free && leaf.node == index)?;
-            continue;
+            ensure(leaves.next().ok_or(())?.node == index)?;
         }
-        ensure(node.kind.is_operation() && node.operands >= 2)?;
-        let mut child = node.first_child;
-        for operand in 0..node.operands {
-            ensure(child < index && owners[child as usize] == NO_NODE)?;
-            owners[child as usize] = index;
-            ensure((nodes[child as usize].is_first == 1) == (operand == 0))?;
-            child = nodes[child as usize].next;
-        }
-        ensure(child == NO_NODE)?;
     }
-    ensure(is_taken.iter().all(|&taken| taken))?;
-    ensure(nodes.iter().zip(&owners).all(|(node, &owner)| node.parent == owner))
+    ensure(leaves.next().is_none())
 }
 
 /// Checks that nodes are a tree over the emitters, parents first: every walk up or down ends.

@@ -12,6 +12,7 @@ pub(crate) mod face;
 pub(crate) mod layout;
 pub(crate) mod node;
 pub(crate) mod record;
+pub(crate) mod solid_tree;
 
 pub use bytes::{PreparedBytes, SceneHash};
 

@@ -4,6 +4,7 @@ use std::ops::Range;
 
 use glam::{DVec2, DVec3};
 
+use super::node::Frame;
 use crate::{exact::float::power_of_two_below_inverse, left_out, transfer::Transfer};
 
 /// The features of the tracer that the scene needs; each is 1 or 0.
@@ -209,32 +210,44 @@ impl SphereRecord {
     }
 }
 
-/// A constructive solid: runs of nodes and of leaves.
+/// A constructive solid: runs of nodes and of leaves, and a hierarchy over the leaves.
 #[derive(Debug, Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
 #[repr(C)]
 pub(crate) struct SolidRecord {
+    /// The frame of the hierarchy's boxes: its origin is the middle of the solid, and 1 / `scale`
+    /// is its size, within a factor of 2.
+    pub(crate) frame: Frame,
+    /// The boxes of the leaves are larger by this on every side, and no crossing of a leaf is in
+    /// doubt by more than an eighth of it: what a ray passes by farther off changes nothing.
+    pub(crate) margin: f64,
     first_node: u32,
     node_count: u32,
     first_leaf: u32,
     leaf_count: u32,
+    /// The root of its hierarchy in the section `solid_boxes`.
+    pub(crate) first_box: u32,
     /// The rank of its first leaf's first face; each leaf has six.
     pub(super) rank: u32,
 }
 
 impl SolidRecord {
-    /// A solid with a run of nodes, a run of leaves and the rank of its first face.
+    /// A solid with a run of nodes, a run of leaves and the rank of its first face, still without
+    /// a hierarchy.
     pub(crate) fn new(nodes: Range<usize>, leaves: Range<usize>, rank: u32) -> Self {
         Self {
+            frame: Frame { origin: [0.0; 3], scale: 1.0 },
+            margin: 0.0,
             first_node: nodes.start as u32,
             node_count: nodes.len() as u32,
             first_leaf: leaves.start as u32,
             leaf_count: leaves.len() as u32,
+            first_box: 0,
             rank,
         }
     }
 
     /// The run of its nodes.
-    pub(super) fn nodes(&self) -> Range<usize> {
+    pub(crate) fn nodes(&self) -> Range<usize> {
         self.first_node as usize..self.first_node as usize + self.node_count as usize
     }
 
@@ -257,7 +270,7 @@ impl SolidNodeKind {
     pub(crate) const INTERSECTION: Self = Self(1);
     /// What is in the first operand and in no other.
     pub(crate) const DIFFERENCE: Self = Self(2);
-    /// A leaf has no operands; its `first_child` is its number among the solid's leaves.
+    /// A leaf has no operands.
     pub(crate) const LEAF: Self = Self(3);
 
     /// Whether it is one of the operations.
@@ -269,20 +282,25 @@ impl SolidNodeKind {
 /// The index that stands where there is no node.
 pub(crate) const NO_NODE: u32 = u32::MAX;
 
-/// A node of a solid's tree. Indices count from the solid's first node; children stand before
-/// their parents.
+/// A node of a solid's tree. Nodes stand in postfix order and leaves in file order, so a node's
+/// subtree is the run that ends with it. Indices count from the solid's first node.
 #[derive(Debug, Clone, Copy, PartialEq, bytemuck::Pod, bytemuck::Zeroable)]
 #[repr(C)]
 pub(crate) struct SolidNodeRecord {
     pub(crate) kind: SolidNodeKind,
-    pub(crate) parent: u32,
-    pub(crate) first_child: u32,
-    /// The parent's next operand, or [`NO_NODE`].
-    pub(crate) next: u32,
     /// An operation has so many operands; a leaf has none.
     pub(crate) operands: u32,
-    /// 1 for the parent's first operand, from which a difference takes the others.
-    pub(crate) is_first: u32,
+    /// The first operand of an operation, the number of a leaf.
+    pub(crate) first_child: u32,
+    /// The root has none: [`NO_NODE`].
+    pub(crate) parent: u32,
+    /// An ancestor farther up, so that few steps lead to any ancestor; the root's is itself.
+    pub(crate) jump: u32,
+    /// The nearest ancestor of which nothing is left if this node is all that is there below it,
+    /// or [`NO_NODE`].
+    pub(crate) dies_at: u32,
+    /// If nothing is left of this node, the leaves before this one make no difference any more.
+    pub(crate) rest: u32,
 }
 
 /// A leaf of a constructive solid: a sphere, or a parallelepiped by its planes.
@@ -302,6 +320,9 @@ pub(crate) struct LeafRecord {
     /// Equal spheres have one surface, within solids or without. That of a parallelepiped means
     /// nothing: its faces have the surfaces of their planes.
     pub(crate) surface: u32,
+    /// Twice the distance of its farthest point from the origin, or a little more: the size of the
+    /// numbers that rounding counts by.
+    pub(crate) extent: f64,
 }
 
 impl LeafRecord {

@@ -92,12 +92,35 @@ impl BoxRay {
         ray
     }
 
+    /// The same ray for boxes in another frame, for boxes that it enters before `reach` and leaves
+    /// after `from`. It may start elsewhere: at `origin`, not far from the frame.
+    #[inline(always)]
+    pub(super) fn in_frame(&self, origin: DVec3, [from, reach]: [f64; 2], frame: &Frame) -> Self {
+        let relative = (origin - DVec3::from_array(frame.origin)) * frame.scale;
+        let mut ray = Self { start: 0.0, scale: frame.scale, slack: 0.0, ..*self };
+        for axis in 0..3 {
+            let (low, high) = (below(relative[axis] - 1e-25), above(relative[axis] + 1e-25));
+            let forward = ray.near[axis] == axis;
+            ray.near_origin[axis] = if forward { high } else { low };
+            ray.far_origin[axis] = if forward { low } else { high };
+        }
+        ray.low = below(from * frame.scale);
+        ray.high = if self.high.is_nan() { f32::NAN } else { above(reach * frame.scale) };
+        ray
+    }
+
     /// Boxes that begin beyond `t` no longer count, nor may those that begin just there be lost:
     /// what is in them may come first in the file.
     #[inline(always)]
     pub(super) fn shorten(&mut self, t: f64) {
         let reach = (t - self.start) * self.scale + self.slack;
         self.high = above(reach + reach.abs() * NEAR);
+    }
+
+    /// Where a box that begins at `near` begins along the ray, within rounding.
+    #[inline(always)]
+    pub(super) fn distance(&self, near: f32) -> f64 {
+        f64::from(near) / self.scale + self.start
     }
 
     /// Whether a box that begins at `near` still counts.
@@ -112,6 +135,11 @@ impl BoxRay {
 ///
 /// A kernel is a value, and only a CPU that runs it has one.
 pub(super) trait BoxKernel: Copy {
+    /// The kernel for code that is compiled for every CPU of the kind.
+    type Plain: BoxKernel;
+
+    fn plain(self) -> Self::Plain;
+
     fn test(self, node: &Node, ray: &BoxRay) -> ([f32; 8], u32);
 }
 
@@ -120,6 +148,13 @@ pub(super) trait BoxKernel: Copy {
 pub(super) struct ScalarBoxes;
 
 impl BoxKernel for ScalarBoxes {
+    type Plain = Self;
+
+    #[inline(always)]
+    fn plain(self) -> Self {
+        self
+    }
+
     #[inline(always)]
     fn test(self, node: &Node, ray: &BoxRay) -> ([f32; 8], u32) {
         // As the SIMD instructions have it: of a NaN (an origin on the plane of a box that the

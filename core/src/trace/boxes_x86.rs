@@ -21,6 +21,13 @@ impl Sse2Boxes {
 }
 
 impl BoxKernel for Sse2Boxes {
+    type Plain = Self;
+
+    #[inline(always)]
+    fn plain(self) -> Self {
+        self
+    }
+
     #[inline(always)]
     fn test(self, node: &Node, ray: &BoxRay) -> ([f32; 8], u32) {
         let mut distances = [0.0; 8];
@@ -77,6 +84,13 @@ impl Avx2Boxes {
 }
 
 impl BoxKernel for Avx2Boxes {
+    type Plain = Sse2Boxes;
+
+    #[inline(always)]
+    fn plain(self) -> Sse2Boxes {
+        Sse2Boxes(())
+    }
+
     #[inline(always)]
     fn test(self, node: &Node, ray: &BoxRay) -> ([f32; 8], u32) {
         let mut distances = [0.0; 8];

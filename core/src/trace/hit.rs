@@ -3,9 +3,10 @@
 use glam::DVec3;
 
 use super::{
+    boxes::{BoxKernel, BoxRay},
     quadrangle::{hit_plane, hit_quadrangle, is_inside},
     ray::{Hit, Ray, Shear},
-    solid::Scratch,
+    solid::{Crossing, Scratch},
     sphere::{hit_sphere, hit_sphere_again},
     triangle::hit_triangle,
 };
@@ -30,8 +31,22 @@ impl<'a> Nearest<'a> {
     }
 
     #[inline(always)]
-    pub(super) fn meet(&mut self, view: &View<'_>, item: Item, scratch: &mut Scratch) {
-        let Some((t, rank, part)) = meet(view, self.ray, &self.shear, item, scratch) else {
+    pub(super) fn meet(
+        &mut self,
+        view: &View<'_>,
+        kernel: impl BoxKernel,
+        box_ray: &BoxRay,
+        item: Item,
+        scratch: &mut Scratch,
+    ) {
+        let met = match item.kind() {
+            Some(Kind::Solid) => {
+                let rays = (self.ray, box_ray);
+                meet_solid(view, kernel.plain(), rays, item.index(), self.hit.t, scratch)
+            }
+            _ => meet(view, self.ray, &self.shear, item),
+        };
+        let Some((t, rank, part)) = met else {
             return;
         };
         if t < self.hit.t || (t == self.hit.t && rank < self.hit.rank && self.hit.is_some()) {
@@ -40,17 +55,11 @@ impl<'a> Nearest<'a> {
     }
 }
 
-/// The distance at which the ray first crosses a face other than the one that it leaves, the
-/// face's rank, and which part of a solid it is. The distance is above 0, or 0 for a face that
-/// coincides with one that the ray went through and comes later.
+/// The distance at which the ray crosses a face other than the one that it leaves, the face's rank,
+/// and its part; `None` for a solid. The distance is above 0, or 0 for a face that coincides with
+/// one that the ray went through and comes later.
 #[inline(always)]
-pub(super) fn meet(
-    view: &View<'_>,
-    ray: &Ray,
-    shear: &Shear,
-    item: Item,
-    scratch: &mut Scratch,
-) -> Option<(f64, u32, Part)> {
+fn meet(view: &View<'_>, ray: &Ray, shear: &Shear, item: Item) -> Option<(f64, u32, Part)> {
     let index = item.index();
     let (t, rank) = match item.kind()? {
         Kind::Triangle => {
@@ -106,51 +115,54 @@ pub(super) fn meet(
             };
             (t, sphere.rank)
         }
-        Kind::Solid => return meet_solid(view, ray, index, scratch),
+        Kind::Solid => return None,
     };
     (t > 0.0).then_some((t, rank, Part::WHOLE))
 }
 
+/// The same for a solid, up to `reach`.
 #[inline(never)]
-pub(super) fn meet_solid(
+fn meet_solid(
     view: &View<'_>,
-    ray: &Ray,
+    kernel: impl BoxKernel,
+    (ray, box_ray): (&Ray, &BoxRay),
     index: usize,
+    reach: f64,
     scratch: &mut Scratch,
 ) -> Option<(f64, u32, Part)> {
     let solid = &view.solids[index];
-    scratch.cross(view, solid, ray, &[]);
-    scratch.crossings.iter().find_map(|crossing| {
-        let part = crossing.part;
+    let mut met = None;
+    scratch.cross((view, solid), kernel, (ray, box_ray), &[], reach, |Crossing { t, part }| {
         let rank = part.rank(solid);
-        let is_met = crossing.t > 0.0
+        let is_met = t > 0.0
             || (rank > ray.after && part.leaf_of(view, solid).surface(part.face()) == ray.leaving);
-        is_met.then_some((crossing.t, rank, part))
-    })
+        met = is_met.then_some((t, rank, part));
+        is_met
+    });
+    met
 }
 
-/// Calls `cross` with the rank and the part of every crossing of a face strictly between the
-/// ray's start and its end, which is a light that the surfaces `ending_on` contain.
+/// Calls `cross` with the rank and the part of the crossings of a face strictly between the ray's
+/// start and its end, which is a light that the surfaces `ending_on` contain, until it says that it
+/// has enough.
 #[inline(always)]
 pub(super) fn between(
     view: &View<'_>,
-    ray: &Ray,
-    shear: &Shear,
-    ending_on: &[Surface],
+    kernel: impl BoxKernel,
+    (ray, shear, box_ray, ending_on): (&Ray, &Shear, &BoxRay, &[Surface]),
     item: Item,
     scratch: &mut Scratch,
-    mut cross: impl FnMut(u32, Part),
+    mut cross: impl FnMut(u32, Part) -> bool,
 ) {
     let index = item.index();
     match item.kind() {
         Some(Kind::Solid) => {
             let solid = &view.solids[index];
-            scratch.cross(view, solid, ray, ending_on);
-            for crossing in &scratch.crossings {
-                if crossing.t > 0.0 && crossing.t < ray.reach {
-                    cross(crossing.part.rank(solid), crossing.part);
-                }
-            }
+            let take = |Crossing { t, part }: Crossing| {
+                t > 0.0 && t < ray.reach && cross(part.rank(solid), part)
+            };
+            let rays = (ray, box_ray);
+            scratch.cross((view, solid), kernel.plain(), rays, ending_on, ray.reach, take);
         }
         Some(Kind::Sphere) => {
             let sphere = &view.spheres[index];
@@ -176,7 +188,7 @@ pub(super) fn between(
             if !ending_on.is_empty() && ending_on.contains(&Face::whole(item).surface(view)) {
                 return;
             }
-            if let Some((t, rank, _)) = meet(view, ray, shear, item, scratch)
+            if let Some((t, rank, _)) = meet(view, ray, shear, item)
                 && t < ray.reach
             {
                 cross(rank, Part::WHOLE);

@@ -1,10 +1,12 @@
 //! Single rays, for tests and benchmarks.
 
+use std::ops::ControlFlow;
+
 use glam::DVec3;
 
 use super::{
     batch::trace,
-    boxes::ScalarBoxes,
+    boxes::{BoxRay, ScalarBoxes},
     hit::{Nearest, between},
     quadrangle::is_inside_in_doubt,
     ray::{Hit, Ray, Shear},
@@ -101,7 +103,8 @@ impl<B: AsRef<[u8]>> Probing for PreparedScene<B> {
         let view = self.view();
         let rays: Vec<Ray> = probes.iter().map(|probe| to_ray(&view, probe)).collect();
         let mut hits = Vec::with_capacity(rays.len());
-        trace(&view, isa, &rays, &mut hits);
+        let go_on = &mut || ControlFlow::Continue(());
+        let _ = trace(&view, isa, &rays, &mut hits, go_on);
         hits.iter().map(|hit| from_hit(&view, hit)).collect()
     }
 
@@ -111,7 +114,10 @@ impl<B: AsRef<[u8]>> Probing for PreparedScene<B> {
         let mut try_all = |probe: &Probe| {
             let ray = to_ray(&view, probe);
             let mut nearest = Nearest::new(&ray);
-            view.items.iter().for_each(|&item| nearest.meet(&view, item, &mut scratch));
+            let box_ray = BoxRay::new(ray.origin, ray.direction, ray.reach, &view.header.frame);
+            for &item in view.items {
+                nearest.meet(&view, ScalarBoxes, &box_ray, item, &mut scratch);
+            }
             from_hit(&view, &nearest.hit)
         };
         probes.iter().map(&mut try_all).collect()
@@ -130,8 +136,8 @@ impl<B: AsRef<[u8]>> Probing for PreparedScene<B> {
                 &ray,
                 &mut Stack::default(),
                 || visits += 1,
-                |item| {
-                    nearest.meet(&view, item, &mut scratch);
+                |item, box_ray| {
+                    nearest.meet(&view, ScalarBoxes, box_ray, item, &mut scratch);
                     Step::On(nearest.hit.t)
                 },
             );
@@ -148,9 +154,9 @@ impl<B: AsRef<[u8]>> Probing for PreparedScene<B> {
             let ray = to_ray(&view, probe);
             let mut nearest = Nearest::new(&ray);
             let shear = nearest.shear;
-            visit(ScalarBoxes, &view, &ray, &mut stack, |item| {
+            visit(ScalarBoxes, &view, &ray, &mut stack, |item, box_ray| {
                 tests.add(&view, &shear, item);
-                nearest.meet(&view, item, &mut scratch);
+                nearest.meet(&view, ScalarBoxes, box_ray, item, &mut scratch);
                 Step::On(nearest.hit.t)
             });
         }
@@ -164,8 +170,12 @@ impl<B: AsRef<[u8]>> Probing for PreparedScene<B> {
             let ray = to_ray(&view, probe);
             let shear = Shear::new(ray.origin, ray.direction);
             let mut crossings = 0;
-            visit(ScalarBoxes, &view, &ray, &mut Stack::default(), |item| {
-                between(&view, &ray, &shear, &[], item, &mut scratch, |_, _| crossings += 1);
+            visit(ScalarBoxes, &view, &ray, &mut Stack::default(), |item, box_ray| {
+                let aim = (&ray, &shear, box_ray, &[][..]);
+                between(&view, ScalarBoxes, aim, item, &mut scratch, |_, _| {
+                    crossings += 1;
+                    false
+                });
                 Step::On(ray.reach)
             });
             crossings

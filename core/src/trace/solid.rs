@@ -1,13 +1,18 @@
 //! Constructive solids: where a ray enters and leaves one.
 //!
-//! Source: Roth, "Ray Casting for Modeling Solids" (1982). Every leaf's crossings with the whole
-//! line of the ray are sorted; walking along them, each operation knows whether the ray is inside
-//! its result, and the root's changes are the solid's surface. Nothing recurses, so no depth of
-//! nesting needs stack.
+//! Source: Roth, "Ray Casting for Modeling Solids" (1982). The ends of the stretches that a ray has
+//! inside the operands of an operation are sorted; walking along them, the operation knows whether
+//! the ray is inside its result, and where that changes are the ends of the result's stretches.
+//!
+//! Only leaves whose boxes the ray touches are met, nearer ones first and no more than the answer
+//! needs. Of the tree only the operations that join two such leaves are looked at, found by jumps,
+//! so neither the number of leaves nor the depth of nesting costs time, and nothing recurses.
+//! docs/proof.md says why what is passed over changes no bit.
 
 use glam::DVec3;
 
 use super::{
+    boxes::{BoxKernel, BoxRay},
     quadrangle::toward_plane,
     ray::Ray,
     sphere::{hit_sphere, hit_sphere_again},
@@ -15,8 +20,9 @@ use super::{
 use crate::prepared::{
     face::Part,
     layout::View,
+    node::Child,
     record::{
-        LeafRecord, NO_NODE, PlaneIndex, SolidNodeKind, SolidNodeRecord, SolidRecord, Surface,
+        LeafRecord, NO_NODE, PlaneRecord, SolidNodeKind, SolidNodeRecord, SolidRecord, Surface,
     },
 };
 
@@ -28,238 +34,809 @@ pub(super) struct Crossing {
     pub(super) part: Part,
 }
 
-/// Where a ray crosses the boundary of a leaf.
-#[derive(Debug, Clone, Copy)]
-struct Event {
+/// The bounds of a crossing's rounding, across the face, in ulp of what [`Course::doubt`] counts
+/// by: docs/proof.md.
+const SPHERE_ULP: f64 = 6.0;
+const PLANE_ULP: f64 = 10.0;
+
+/// Leaves that are collected before the first look at what they make.
+const FIRST_LOOK: usize = 12;
+
+/// Where a stretch of the ray inside something begins or ends.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct End {
+    /// Along the course.
     t: f64,
-    /// How far rounding may have moved it.
-    doubt: f64,
-    leaf: u32,
-    face: u32,
+    /// Rounding may have moved it as far as these.
+    low: f64,
+    high: f64,
+    part: Part,
+    /// The place among the operands that are being joined.
+    operand: u32,
+    /// Whether the stretch begins here.
+    enters: bool,
+    pin: Pin,
+}
+
+/// Whether it is known exactly where an end is.
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum Pin {
+    No,
+    /// On the surface that the ray leaves.
+    Start,
+    /// On the surface that it ends on.
+    Goal,
+}
+
+/// A ray on its way through a solid. It starts near the solid, wherever the ray does: so rounding is
+/// as fine as the solid.
+struct Course<'a> {
+    view: &'a View<'a>,
+    solid: &'a SolidRecord,
+    nodes: &'a [SolidNodeRecord],
+    leaves: &'a [LeafRecord],
+    ending_on: &'a [Surface],
+    ray: &'a Ray,
+    /// The ray from its start on the course, with its end there.
+    near: Ray,
+    /// The course starts here on the ray.
+    start: f64,
+    /// The length of the vector to where it starts.
+    size: f64,
+}
+
+impl<'a> Course<'a> {
+    fn new(
+        view: &'a View<'a>,
+        solid: &'a SolidRecord,
+        ray: &'a Ray,
+        ending_on: &'a [Surface],
+    ) -> Self {
+        let ahead = (DVec3::from_array(solid.frame.origin) - ray.origin).dot(ray.direction);
+        let start = if ahead.abs() * solid.frame.scale > 8.0 { ahead } else { 0.0 };
+        let origin = ray.origin + start * ray.direction;
+        Self {
+            view,
+            solid,
+            nodes: view.solid_nodes(solid),
+            leaves: view.solid_leaves(solid),
+            ending_on,
+            ray,
+            near: Ray { origin, reach: ray.reach - start, ..*ray },
+            start,
+            size: origin.length(),
+        }
+    }
+
+    /// How far rounding may move a crossing of a leaf along the ray, which meets it at a cosine. No
+    /// more than the boxes of leaves have for it.
+    fn doubt(&self, leaf: &LeafRecord, ulp: f64, t: f64, cosine: f64) -> f64 {
+        let bound = ulp * f64::EPSILON * (leaf.extent + self.size + t.abs()) / cosine;
+        bound.min(self.solid.margin / 8.0)
+    }
+
+    /// An end of the stretch inside a leaf; rounding moves it no farther than its doubt.
+    #[inline(always)]
+    fn end(&self, leaf: &LeafRecord, ulp: f64, (t, cosine): (f64, f64), pin: Pin) -> End {
+        let doubt = if pin == Pin::No { self.doubt(leaf, ulp, t, cosine) } else { 0.0 };
+        let (low, high) = (t - doubt, t + doubt);
+        End { t, low, high, part: Part::WHOLE, operand: 0, enters: true, pin }
+    }
+
+    /// The stretch of the ray's line that is inside a leaf; `None` if there is none, or none that
+    /// rounding leaves.
+    #[inline(always)]
+    fn meet_leaf(&self, number: u32) -> Option<[End; 2]> {
+        let leaf = &self.leaves[number as usize];
+        let ([enter, leave], faces) =
+            if leaf.is_sphere() { (self.meet_sphere(leaf)?, [0, 0]) } else { self.meet_box(leaf)? };
+        let [enter_part, leave_part] = faces.map(|face| Part::new(number, face));
+        (enter.high < leave.low).then_some([
+            End { part: enter_part, ..enter },
+            End { part: leave_part, enters: false, ..leave },
+        ])
+    }
+
+    /// Where the line enters and leaves a sphere.
+    #[inline(always)]
+    fn meet_sphere(&self, leaf: &LeafRecord) -> Option<[End; 2]> {
+        let center = DVec3::from_array(leaf.center);
+        let surface = Surface(leaf.surface);
+        let is_left = self.ray.leaving == surface;
+        let is_goal = self.ending_on.contains(&surface);
+        let (ends, pins) = if is_left && is_goal {
+            ([-self.start, self.near.reach], [Pin::Start, Pin::Goal])
+        } else if is_left {
+            let again = hit_sphere_again(self.ray, center);
+            let ends = [again.min(0.0) - self.start, again.max(0.0) - self.start];
+            (ends, if again > 0.0 { [Pin::Start, Pin::No] } else { [Pin::No, Pin::Start] })
+        } else if is_goal {
+            let end = self.ray.origin + self.ray.reach * self.ray.direction;
+            let again = hit_sphere_again(&Ray { origin: end, ..*self.ray }, center);
+            let ends = [self.near.reach + again.min(0.0), self.near.reach + again.max(0.0)];
+            (ends, if again > 0.0 { [Pin::Goal, Pin::No] } else { [Pin::No, Pin::Goal] })
+        } else {
+            (hit_sphere(&self.near, center, leaf.radius)?, [Pin::No; 2])
+        };
+        let cosine = (ends[1] - ends[0]) / (2.0 * leaf.radius);
+        Some([0, 1].map(|k| self.end(leaf, SPHERE_ULP, (ends[k], cosine), pins[k])))
+    }
+
+    /// Where the line enters and leaves a parallelepiped, and through which faces.
+    #[inline(always)]
+    fn meet_box(&self, leaf: &LeafRecord) -> Option<([End; 2], [u32; 2])> {
+        // The place, the cosine, the face.
+        let mut enter = (f64::NEG_INFINITY, 1.0, 0, Pin::No);
+        let mut leave = (f64::INFINITY, 1.0, 0, Pin::No);
+        for (face, &plane) in (0..).zip(&leaf.planes) {
+            let PlaneRecord { point, normal } = &self.view.planes[plane.index()];
+            let [point, normal] = [*point, *normal].map(DVec3::from_array);
+            let (distance, along) = toward_plane(&self.near, point, normal);
+            let (distance, along) = (distance * plane.sign(), along * plane.sign());
+            if along == 0.0 {
+                if distance < 0.0 {
+                    return None; // Outside, and never nearer.
+                }
+                continue;
+            }
+            let surface = plane.surface();
+            let (t, pin) = if self.ray.leaving == surface {
+                (-self.start, Pin::Start)
+            } else if self.ending_on.contains(&surface) {
+                (self.near.reach, Pin::Goal)
+            } else {
+                (distance / along, Pin::No)
+            };
+            if along < 0.0 && t > enter.0 {
+                enter = (t, -along, face, pin);
+            } else if along > 0.0 && t < leave.0 {
+                leave = (t, along, face, pin);
+            }
+        }
+        let end = |(t, cosine, _, pin)| self.end(leaf, PLANE_ULP, (t, cosine), pin);
+        (enter.0 < leave.0).then(|| ([end(enter), end(leave)], [enter.2, leave.2]))
+    }
+
+    /// The nearest common ancestor of two nodes, of which `a` comes first and is no ancestor of
+    /// `b`.
+    fn join(&self, a: u32, b: u32) -> u32 {
+        let mut node = a;
+        while node < b {
+            let SolidNodeRecord { jump, parent, .. } = self.nodes[node as usize];
+            node = if jump < b { jump } else { parent };
+        }
+        node
+    }
+
+    /// The crossing at an end.
+    fn crossing(&self, end: &End) -> Crossing {
+        let t = match end.pin {
+            Pin::No => self.start + end.t,
+            Pin::Start => 0.0,
+            Pin::Goal => self.ray.reach,
+        };
+        Crossing { t, part: end.part }
+    }
+}
+
+/// The stretches inside a part of the tree, in order: a run of [`Scratch::ends`].
+#[derive(Debug, Clone, Copy)]
+struct Stretches {
+    /// Their node.
+    node: u32,
+    /// The nearest operation above it and above the stretches that stand before it, or [`NO_NODE`].
+    join: u32,
+    /// The run begins here and goes on to the next one's.
+    first: usize,
 }
 
 /// Room to work in, kept from ray to ray.
 #[derive(Debug, Default)]
 pub(super) struct Scratch {
-    events: Vec<Event>,
-    /// For each node, whether the ray is inside it.
-    inside: Vec<bool>,
-    /// For each node, how many operands the ray is inside of; a difference counts those that are
-    /// taken away.
-    counts: Vec<u32>,
-    /// For each node, the crossing at which it was last flipped, and whether the ray was inside it
-    /// before.
-    flipped: Vec<u32>,
-    before: Vec<bool>,
-    crossing: u32,
-    /// The face at which each leaf is crossed last.
-    faces: Vec<u32>,
-    /// The result.
-    pub(super) crossings: Vec<Crossing>,
+    /// Nodes of the hierarchy that wait, and how far away they begin.
+    waiting: Vec<(f32, Child)>,
+    /// The leaves that the ray touches, in file order.
+    touched: Vec<u32>,
+    /// What waits to be joined, and its ends.
+    parts: Vec<Stretches>,
+    ends: Vec<End>,
+    /// How much of the ray was in doubt, all in all.
+    doubted: f64,
 }
 
 impl Scratch {
-    /// Finds where the ray, from its start on, crosses the solid's surface, in order. A surface
-    /// that it leaves is crossed at 0, and one that it ends on (`ending_on`) at its reach.
+    /// Calls `take` for the crossings of the solid's surface from the ray's start up to `reach`, in
+    /// order, until it says that it has enough. A surface that the ray leaves is crossed at 0, and
+    /// one that it ends on (`ending_on`) at the ray's own reach.
     pub(super) fn cross(
         &mut self,
+        (view, solid): (&View<'_>, &SolidRecord),
+        kernel: impl BoxKernel,
+        (ray, box_ray): (&Ray, &BoxRay),
+        ending_on: &[Surface],
+        reach: f64,
+        mut take: impl FnMut(Crossing) -> bool,
+    ) {
+        let course = Course::new(view, solid, ray, ending_on);
+        let reach = reach - course.start;
+        let margin = solid.margin;
+        let stretch = [-course.start - 2.0 * margin, reach + 2.0 * margin];
+        let box_ray = box_ray.in_frame(course.near.origin, stretch, &solid.frame);
+        self.waiting.clear();
+        self.waiting.push((f32::NEG_INFINITY, Child::inner(solid.first_box as usize)));
+        self.touched.clear();
+        // What comes up to here was told, or does not count.
+        let mut told = -course.start - margin;
+        let mut enough = FIRST_LOOK;
+        loop {
+            let next = self.touch_leaves(view, kernel, &box_ray, enough);
+            if self.touched.is_empty() {
+                return;
+            }
+            if !self.touched.is_sorted() {
+                self.touched.sort_unstable();
+            }
+            self.join_touched(&course);
+            let mut known =
+                next.map_or(reach, |near| box_ray.distance(near) - 3.0 * margin).min(reach);
+            if self.doubted > margin / 2.0 {
+                // What was passed over might be in one doubt with the rest.
+                self.touched.clear();
+                self.touched.extend(0..course.leaves.len() as u32);
+                self.waiting.clear();
+                self.join_touched(&course);
+                known = reach;
+            }
+            for end in self.ends.iter().filter(|end| told < end.t && end.t <= known) {
+                let crossing = course.crossing(end);
+                if crossing.t >= 0.0 && take(crossing) {
+                    return;
+                }
+            }
+            told = told.max(known);
+            if self.waiting.is_empty() {
+                return;
+            }
+            enough *= 2;
+        }
+    }
+
+    /// Adds leaves that the ray touches, until there are `enough`; where the first of the others
+    /// may begin, if there are more.
+    fn touch_leaves(
+        &mut self,
         view: &View<'_>,
-        solid: &SolidRecord,
+        kernel: impl BoxKernel,
+        box_ray: &BoxRay,
+        enough: usize,
+    ) -> Option<f32> {
+        while self.touched.len() < enough
+            && let Some((_, child)) = self.waiting.pop()
+        {
+            let node = &view.solid_boxes[child.node()];
+            let (distances, mut mask) = kernel.test(node, box_ray);
+            let first = self.waiting.len();
+            while mask != 0 {
+                let child = mask.trailing_zeros() as usize & 7;
+                mask &= mask - 1;
+                let (near, child) = (distances[child], node.children[child]);
+                if child.is_leaf() {
+                    self.touched.push(child.items().start as u32);
+                } else {
+                    // The nearest comes to stand on top.
+                    let is_farther = |&(other, _): &(f32, Child)| other >= near;
+                    let at = first + self.waiting[first..].partition_point(is_farther);
+                    self.waiting.insert(at, (near, child));
+                }
+            }
+        }
+        self.waiting.iter().map(|&(near, _)| near).reduce(f32::min)
+    }
+
+    /// Joins the stretches inside the leaves that are touched as the tree says; `ends` has the
+    /// result.
+    fn join_touched(&mut self, course: &Course<'_>) {
+        self.parts.clear();
+        self.ends.clear();
+        self.doubted = 0.0;
+        let node_of = |leaf: u32| course.leaves[leaf as usize].node;
+        // The leaves before this one make no difference any more.
+        let mut rest = 0;
+        // Where the next leaf meets the last part, if that is known.
+        let mut next_join: Option<u32> = None;
+        for at in 0..self.touched.len() {
+            let number = self.touched[at];
+            if number < rest {
+                continue;
+            }
+            let node = node_of(number);
+            let record = &course.nodes[node as usize];
+            // What is whole before the leaf is joined; where the leaf meets what is left.
+            let mut join = NO_NODE;
+            while let Some(last) = self.parts.last() {
+                join = next_join.take().unwrap_or_else(|| course.join(last.node, node));
+                if last.join >= join {
+                    break;
+                }
+                self.join_last(course, &mut rest);
+                join = NO_NODE;
+            }
+            if number < rest {
+                continue;
+            }
+            // It is alone up to there, or to where it meets what comes next.
+            let next = self.touched.get(at + 1).map(|&next| course.join(node, node_of(next)));
+            let is_lost = record.dies_at < join.min(next.unwrap_or(NO_NODE));
+            let ends = if is_lost { None } else { course.meet_leaf(number) };
+            if let Some(ends) = ends {
+                self.parts.push(Stretches { node, join, first: self.ends.len() });
+                self.ends.extend(ends);
+                next_join = next;
+            } else {
+                rest = record.rest;
+            }
+        }
+        while self.parts.len() > 1 {
+            self.join_last(course, &mut rest);
+        }
+        let is_lost = |last: &Stretches| course.nodes[last.node as usize].dies_at != NO_NODE;
+        if self.parts.first().is_some_and(is_lost) {
+            self.ends.clear();
+        }
+    }
+
+    /// Joins the last parts at the operation that they have in common. If nothing is left of it,
+    /// leaves before `rest` make no difference any more.
+    fn join_last(&mut self, course: &Course<'_>, rest: &mut u32) {
+        let node = self.parts.last().expect("parts to join").join;
+        let first = self.parts.iter().rposition(|part| part.join != node).expect("a first operand");
+        let Stretches { join, first: first_end, .. } = self.parts[first];
+        let record = &course.nodes[node as usize];
+        let (mut operands, mut end_count) = (0, first_end);
+        let mut has_first = false;
+        for at in first..self.parts.len() {
+            let part = self.parts[at];
+            if course.nodes[part.node as usize].dies_at < node {
+                continue;
+            }
+            // Up to it stand the nodes of the first operand.
+            has_first |= part.node <= record.first_child;
+            let end = self.parts.get(at + 1).map_or(self.ends.len(), |next| next.first);
+            if part.first > end_count {
+                self.ends.copy_within(part.first..end, end_count);
+            }
+            let moved = end_count..end_count + (end - part.first);
+            end_count = moved.end;
+            for end in &mut self.ends[moved] {
+                end.operand = operands;
+            }
+            operands += 1;
+        }
+        self.parts.truncate(first);
+        self.ends.truncate(end_count);
+        let is_left = match record.kind {
+            SolidNodeKind::UNION => true,
+            SolidNodeKind::INTERSECTION => operands == record.operands,
+            _ => has_first,
+        };
+        let count = if is_left { self.join_ends(record, first_end) } else { 0 };
+        self.ends.truncate(first_end + count);
+        if count > 0 {
+            self.parts.push(Stretches { node, join, first: first_end });
+        } else {
+            *rest = (*rest).max(record.rest);
+        }
+    }
+
+    /// Puts the ends of an operation's stretches in the place of its operands' ends, which are the
+    /// last ones; how many there are. Ends that rounding cannot tell apart are one step: where the
+    /// ray is inside before and after it the operation has no surface.
+    fn join_ends(&mut self, operation: &SolidNodeRecord, first: usize) -> usize {
+        let ends = &mut self.ends[first..];
+        sort(ends);
+        let takes_away = operation.kind == SolidNodeKind::DIFFERENCE;
+        let is_intersection = operation.kind == SolidNodeKind::INTERSECTION;
+        let needed = if is_intersection { operation.operands.cast_signed() } else { 1 };
+        // The ray is inside where it is in so many operands; one that is taken away counts against.
+        let mut depth = 0;
+        let (mut next, mut count) = (0, 0);
+        while next < ends.len() {
+            let (from, before) = (next, depth >= needed);
+            let mut high = ends[from].high;
+            loop {
+                let end = &ends[next];
+                let adds = end.enters ^ (takes_away && end.operand > 0);
+                depth += if adds { 1 } else { -1 };
+                high = high.max(end.high);
+                next += 1;
+                if ends.get(next).is_none_or(|end| end.low > high) {
+                    break;
+                }
+            }
+            self.doubted += high - ends[from].low;
+            let enters = depth >= needed;
+            if before != enters {
+                let wanted = |end: &End| enters ^ (takes_away && end.operand > 0);
+                ends[count] = step(&mut ends[from..next], enters, wanted);
+                count += 1;
+            }
+        }
+        count
+    }
+}
+
+/// Sorts ends by where they begin. Few are many times faster sorted so; many are rare.
+fn sort(ends: &mut [End]) {
+    if ends.len() > 32 {
+        return ends.sort_by(|a, b| a.low.total_cmp(&b.low));
+    }
+    for k in 1..ends.len() {
+        let end = ends[k];
+        let mut at = k;
+        while at > 0 && ends[at - 1].low > end.low {
+            ends[at] = ends[at - 1];
+            at -= 1;
+        }
+        ends[at] = end;
+    }
+}
+
+/// The end of an operation's stretch at a step of its operands: the face is that of the first
+/// operand in file order that made it change, by entering or leaving as is `wanted` of it.
+#[inline(always)]
+fn step(step: &mut [End], enters: bool, wanted: impl Fn(&End) -> bool) -> End {
+    if let [end] = step { End { enters, ..*end } } else { long_step(step, enters, wanted) }
+}
+
+/// The same for more than one end.
+#[inline(never)]
+fn long_step(step: &mut [End], enters: bool, wanted: impl Fn(&End) -> bool) -> End {
+    let pinned = (step.iter().find(|end| end.pin == Pin::Start))
+        .or_else(|| step.iter().find(|end| end.pin == Pin::Goal))
+        .copied();
+    step.sort_by_key(|end| end.operand);
+    // An operand that the ray enters and leaves within the step does not change in it.
+    let mut operands = step.chunk_by(|a, b| a.operand == b.operand);
+    let changed = operands.find(|ends| ends.len() % 2 == 1 && ends[0].enters == wanted(&ends[0]));
+    let end = changed.expect("an operation changes only if an operand does")[0];
+    // What cannot be told from the ray's start or its end is there.
+    let End { t, low, high, pin, .. } = pinned.unwrap_or(end);
+    End { t, low, high, enters, pin, ..end }
+}
+
+#[cfg(test)]
+mod tests {
+    use rtfarm_oracle::{
+        hard_case::{few_rays, random},
+        random::Random,
+    };
+
+    use super::*;
+    use crate::{
+        isa::Isa,
+        prepare::prepare,
+        prepared::{PreparedBytes, PreparedScene},
+        scene::{Material, Operation, Parallelepiped, Scene, Solid, SolidNode, Sphere, Viewport},
+        trace::{boxes::KernelWork, kernels::run_with_kernel},
+    };
+
+    /// The plain evaluation of every leaf and every node, whatever the ray touches.
+    fn plain(course: &Course<'_>, node: u32) -> Vec<End> {
+        let record = &course.nodes[node as usize];
+        if record.kind == SolidNodeKind::LEAF {
+            return course.meet_leaf(record.first_child).map_or(Vec::new(), Vec::from);
+        }
+        let children = (0..node).filter(|&child| course.nodes[child as usize].parent == node);
+        let mut ends: Vec<(usize, End)> = children
+            .enumerate()
+            .flat_map(|(k, child)| plain(course, child).into_iter().map(move |end| (k, end)))
+            .collect();
+        ends.sort_by(|a, b| a.1.low.total_cmp(&b.1.low));
+        let is_in = |operands: &[bool]| match record.kind {
+            SolidNodeKind::UNION => operands.contains(&true),
+            SolidNodeKind::INTERSECTION => !operands.contains(&false),
+            _ => operands[0] && !operands[1..].contains(&true),
+        };
+        let mut operands = vec![false; record.operands as usize];
+        let mut found = Vec::new();
+        let mut next = 0;
+        while next < ends.len() {
+            let (from, mut high) = (next, f64::NEG_INFINITY);
+            while next < ends.len() && (next == from || ends[next].1.low <= high) {
+                high = high.max(ends[next].1.high);
+                next += 1;
+            }
+            let step = &ends[from..next];
+            let before = operands.clone();
+            for &(k, _) in step {
+                operands[k] = !operands[k];
+            }
+            let enters = is_in(&operands);
+            if is_in(&before) == enters {
+                continue;
+            }
+            let is_taken = |k: usize| record.kind == SolidNodeKind::DIFFERENCE && k > 0;
+            let operand = (0..operands.len())
+                .find(|&k| before[k] != operands[k] && operands[k] == (enters ^ is_taken(k)))
+                .unwrap();
+            let end = step.iter().find(|(k, _)| *k == operand).unwrap().1;
+            let pinned = |pin| step.iter().map(|(_, end)| end).find(|end| end.pin == pin);
+            let place = pinned(Pin::Start).or_else(|| pinned(Pin::Goal)).unwrap_or(&end);
+            let End { t, low, high, pin, .. } = *place;
+            found.push(End { t, low, high, enters, pin, ..end });
+        }
+        found
+    }
+
+    /// All crossings up to `reach` by the plain evaluation.
+    fn plain_crossings(course: &Course<'_>, reach: f64) -> Vec<Crossing> {
+        let ends = plain(course, course.nodes.len() as u32 - 1);
+        ends.iter()
+            .filter(|end| end.t <= reach - course.start)
+            .map(|end| course.crossing(end))
+            .filter(|crossing| crossing.t >= 0.0)
+            .collect()
+    }
+
+    /// How the numbers of a solid are drawn.
+    #[derive(Debug, Clone, Copy, PartialEq)]
+    enum Style {
+        Plain,
+        /// Multiples of 1/4: shared planes and spheres, tangent faces, rays in planes.
+        Grid,
+        /// Far from the origin.
+        Far,
+        /// Sizes from 1e-4 to 1e4.
+        Extreme,
+    }
+
+    fn place(random: &mut Random, style: Style) -> DVec3 {
+        let place = random.in_cube();
+        if style == Style::Grid { (place * 4.0).round() / 4.0 } else { place }
+    }
+
+    fn random_leaf(random: &mut Random, style: Style, scale: f64, primitive: u32) -> SolidNode {
+        let shift = if style == Style::Far { DVec3::new(1e6, -2e6, 3e5) } else { DVec3::ZERO };
+        let scale =
+            if style == Style::Extreme { scale * random.log_uniform(1e-4, 1e4) } else { scale };
+        let center = shift + place(random, style);
+        let size = random.between(0.1, 1.0) * scale;
+        let size = if style == Style::Grid { (size * 4.0).ceil() / 4.0 } else { size };
+        if random.chance(0.5) {
+            return SolidNode::Sphere(Sphere { center, radius: size, material: 0, primitive });
+        }
+        let mut edges = [DVec3::X, DVec3::Y, DVec3::Z].map(|axis| axis * size);
+        if style != Style::Grid && random.chance(0.5) {
+            edges = edges.map(|edge| edge + random.in_cube() * 0.3 * size);
+        }
+        let corner = center - edges.iter().sum::<DVec3>() / 2.0;
+        SolidNode::Parallelepiped(Parallelepiped { corner, edges, material: 0, primitive })
+    }
+
+    /// A solid of so many leaves; a nested one is as deep as they are many.
+    fn random_solid(random: &mut Random, style: Style, leaf_count: u32, is_nested: bool) -> Solid {
+        let mut nodes: Vec<SolidNode> = Vec::new();
+        let (mut ready, mut leaves) = (0, Vec::new());
+        for primitive in 0..leaf_count {
+            // The first is large: there is something to take away from. Others return.
+            let scale = if primitive == 0 { 2.0 } else { 2.0 / f64::from(leaf_count).cbrt() };
+            let leaf = match leaves.get(random.below(4 * leaf_count as usize)) {
+                Some(&leaf) => leaf,
+                None => random_leaf(random, style, scale, primitive),
+            };
+            leaves.push(leaf);
+            nodes.push(leaf);
+            ready += 1;
+            // An intersection of many things is empty.
+            let operations = [Operation::Union, Operation::Difference, Operation::Intersection];
+            let may_intersect = leaf_count < 9 || random.chance(0.02);
+            let choice = random.below(if may_intersect { 3 } else { 2 });
+            if ready >= 2 && (is_nested || random.chance(0.4)) {
+                let most = ready.min(4) as usize;
+                let operands = if is_nested { 2 } else { 2 + random.below(most - 1) as u32 };
+                nodes.push(SolidNode::Operation { operation: operations[choice], operands });
+                ready -= operands - 1;
+            }
+        }
+        if ready > 1 {
+            let operation =
+                if random.chance(0.5) { Operation::Union } else { Operation::Difference };
+            nodes.push(SolidNode::Operation { operation, operands: ready });
+        }
+        Solid { nodes, primitive: 0 }
+    }
+
+    /// A scene of this solid alone.
+    fn opened(solid: Solid) -> PreparedScene<PreparedBytes> {
+        let viewport = Viewport {
+            eye: DVec3::Z * 5.0,
+            top_left: DVec3::new(-1.0, 1.0, 0.0),
+            bottom_left: DVec3::new(-1.0, -1.0, 0.0),
+            top_right: DVec3::new(1.0, 1.0, 0.0),
+        };
+        let material = Material {
+            name: "m".into(),
+            color: DVec3::ONE,
+            alpha: 1.0,
+            reflect: 0.0,
+            refract: 0.0,
+            texture: None,
+        };
+        let scene = Scene {
+            viewport: Some(viewport),
+            materials: vec![material],
+            solids: vec![solid],
+            ..Scene::default()
+        };
+        PreparedScene::open(prepare(&scene).unwrap()).unwrap()
+    }
+
+    /// A point on a leaf, on an edge or a corner too, and a direction there along the leaf.
+    fn point_on(random: &mut Random, leaf: &SolidNode) -> (DVec3, DVec3) {
+        match leaf {
+            SolidNode::Sphere(sphere) => {
+                let normal = random.direction();
+                let (a, b) = normal.any_orthonormal_pair();
+                let along = random.between(-1.0, 1.0) * a + random.between(-1.0, 1.0) * b;
+                (sphere.center + normal * sphere.radius, along)
+            }
+            SolidNode::Parallelepiped(solid) => {
+                let mut point = solid.corner;
+                for edge in solid.edges {
+                    point += edge * [0.0, 1.0, random.unit()][random.below(3)];
+                }
+                let [a, b, _] = solid.edges;
+                (point, random.between(-1.0, 1.0) * a + random.between(-1.0, 1.0) * b)
+            }
+            SolidNode::Operation { .. } => (DVec3::ZERO, DVec3::X),
+        }
+    }
+
+    /// A ray at a leaf, from near or far: at a point of it, along it, along an axis.
+    fn random_ray(random: &mut Random, solid: &Solid, style: Style) -> (DVec3, DVec3) {
+        let node = &solid.nodes[random.below(solid.nodes.len())];
+        let (target, along) = point_on(random, node);
+        let direction = match random.below(4) {
+            0 => along,
+            1 => DVec3::AXES[random.below(3)] * random.sign(),
+            2 if style == Style::Grid => place(random, style) + DVec3::X,
+            _ => random.direction(),
+        };
+        let direction = direction / direction.length();
+        let direction = if direction.is_finite() { direction } else { DVec3::Y };
+        let back = [0.25, 5.0, random.log_uniform(1e-6, 1e6)][random.below(3)];
+        (target - back * direction, direction)
+    }
+
+    /// What a ray is told of, with the kernel of an instruction set.
+    struct Told<'a> {
+        solid: &'a SolidRecord,
+        scratch: &'a mut Scratch,
+        ray: &'a Ray,
+        ending_on: &'a [Surface],
+        most: usize,
+        found: Vec<Crossing>,
+    }
+
+    impl KernelWork<View<'_>> for Told<'_> {
+        fn run(&mut self, view: &View<'_>, kernel: impl BoxKernel) {
+            let Self { solid, ray, most, .. } = *self;
+            let box_ray = BoxRay::new(ray.origin, ray.direction, ray.reach, &view.header.frame);
+            let rays = (ray, &box_ray);
+            self.scratch.cross(
+                (view, solid),
+                kernel,
+                rays,
+                self.ending_on,
+                ray.reach,
+                |crossing| {
+                    self.found.push(crossing);
+                    self.found.len() == most
+                },
+            );
+        }
+    }
+
+    /// The crossings of the plain evaluation, which are those that a ray is told of.
+    fn check(
+        view: &View<'_>,
+        (isa, scratch): (Isa, &mut Scratch),
         ray: &Ray,
         ending_on: &[Surface],
-    ) {
-        self.crossings.clear();
-        self.events.clear();
-        let leaves = view.solid_leaves(solid);
-        for (number, leaf) in (0..).zip(leaves) {
-            push_events(&mut self.events, view, leaf, number, ray, ending_on);
+        what: &str,
+    ) -> Vec<Crossing> {
+        let solid = &view.solids[0];
+        let truth = plain_crossings(&Course::new(view, solid, ray, ending_on), ray.reach);
+        let bits = |crossings: &[Crossing]| {
+            crossings.iter().map(|it| (it.t.to_bits(), it.part)).collect::<Vec<_>>()
+        };
+        // Told to stop at one of them, it tells of no other; told of all, it has told of all.
+        for most in [1, truth.len() / 2 + 1, truth.len() + 1] {
+            let mut told = Told { solid, scratch, ray, ending_on, most, found: Vec::new() };
+            run_with_kernel(isa, view, &mut told);
+            let found = told.found;
+            let expected = &truth[..most.min(truth.len())];
+            assert_eq!(bits(&found), bits(expected), "{what}: {ray:?}: {found:?}, {truth:?}");
         }
-        if self.events.is_empty() {
-            return;
-        }
-        self.events.sort_unstable_by(|a, b| {
-            a.t.total_cmp(&b.t).then(a.leaf.cmp(&b.leaf)).then(a.face.cmp(&b.face))
-        });
-        let nodes = view.solid_nodes(solid);
-        self.inside.clear();
-        self.inside.resize(nodes.len(), false);
-        self.counts.clear();
-        self.counts.resize(nodes.len(), 0);
-        self.before.resize(nodes.len(), false);
-        self.flipped.clear();
-        self.flipped.resize(nodes.len(), 0);
-        self.crossing = 0;
-        self.faces.resize(leaves.len(), 0);
-
-        let mut next = 0;
-        while next < self.events.len() {
-            // Crossings that rounding cannot tell apart are one.
-            let first = self.events[next];
-            let mut end = next;
-            self.crossing += 1;
-            while let Some(&event) = self.events.get(end) {
-                if event.t - first.t > first.doubt + event.doubt {
-                    break;
-                }
-                self.faces[event.leaf as usize] = event.face;
-                self.flip(nodes, leaves[event.leaf as usize].node);
-                end += 1;
-            }
-            let root = nodes.len() - 1;
-            if self.has_changed(root) {
-                let leaf = self.responsible(nodes);
-                let face = self.faces[leaf as usize];
-                let of_leaf = |event: &&Event| event.leaf == leaf && event.face == face;
-                let event = self.events[next..end].iter().find(of_leaf).unwrap_or(&first);
-                // At its start and its end the ray only touches.
-                let is_start = self.events[next..end].iter().any(|event| event.t == 0.0);
-                let t = if is_start { 0.0 } else { event.t };
-                if t >= 0.0 {
-                    self.crossings.push(Crossing { t, part: Part::new(leaf, face) });
-                }
-            }
-            next = end;
-        }
+        truth
     }
 
-    /// The ray crosses a leaf: what that changes up to the root.
-    fn flip(&mut self, nodes: &[SolidNodeRecord], leaf: u32) {
-        let mut node = leaf as usize;
-        loop {
-            if self.flipped[node] != self.crossing {
-                self.flipped[node] = self.crossing;
-                self.before[node] = self.inside[node];
-            }
-            let is_inside = !self.inside[node];
-            self.inside[node] = is_inside;
-            let SolidNodeRecord { parent, is_first, .. } = nodes[node];
-            if parent == NO_NODE {
-                return;
-            }
-            let parent = parent as usize;
-            let record = &nodes[parent];
-            let is_minuend = record.kind == SolidNodeKind::DIFFERENCE && is_first == 1;
-            if !is_minuend {
-                let count = &mut self.counts[parent];
-                *count = if is_inside { *count + 1 } else { *count - 1 };
-            }
-            let count = self.counts[parent];
-            let result = match record.kind {
-                SolidNodeKind::UNION => count > 0,
-                SolidNodeKind::INTERSECTION => count == record.operands,
-                _ => self.inside[record.first_child as usize] && count == 0,
+    /// Rays at a solid: from anywhere, on from every crossing, and towards a surface. How many
+    /// crossings there were.
+    fn check_solid(
+        random: &mut Random,
+        solid: &Solid,
+        style: Style,
+        count: usize,
+        what: &str,
+    ) -> usize {
+        let prepared = opened(solid.clone());
+        let view = prepared.view();
+        let mut scratch = Scratch::default();
+        let isas: Vec<Isa> = Isa::ALL.into_iter().filter(|isa| isa.is_supported()).collect();
+        let mut crossed = 0;
+        for k in 0..count {
+            let mut check = |ray: &Ray, ending_on: &[Surface]| {
+                let truth =
+                    check(&view, (isas[k % isas.len()], &mut scratch), ray, ending_on, what);
+                crossed += truth.len();
+                truth
             };
-            if result == self.inside[parent] {
-                return;
-            }
-            node = parent;
-        }
-    }
-
-    /// Whether the current crossing leads into or out of a node's solid.
-    fn has_changed(&self, node: usize) -> bool {
-        self.flipped[node] == self.crossing && self.before[node] != self.inside[node]
-    }
-
-    /// The leaf whose face is the solid's surface where the root has changed: at each operation
-    /// the first operand in file order that made it change.
-    fn responsible(&self, nodes: &[SolidNodeRecord]) -> u32 {
-        let mut node = nodes.len() - 1;
-        let mut enters = self.inside[node];
-        while nodes[node].kind != SolidNodeKind::LEAF {
-            let takes_away = nodes[node].kind == SolidNodeKind::DIFFERENCE;
-            let mut child = nodes[node].first_child;
-            loop {
-                let is_first = nodes[child as usize].is_first == 1;
-                let wanted = if takes_away && !is_first { !enters } else { enters };
-                let at = child as usize;
-                if self.has_changed(at) && self.inside[at] == wanted {
-                    (node, enters) = (at, wanted);
-                    break;
-                }
-                child = nodes[at].next;
-                assert!(child != NO_NODE, "an operation changes only if an operand does");
+            let (origin, direction) = random_ray(random, solid, style);
+            let ray = Ray {
+                origin: origin * view.header.scale,
+                direction,
+                reach: f64::INFINITY,
+                leaving: Surface::NONE,
+                after: Ray::NOTHING_AHEAD,
+            };
+            let truth = check(&ray, &[]);
+            let Some(&Crossing { t, part }) = truth.get(random.below(truth.len().max(1))) else {
+                continue;
+            };
+            let surface = part.leaf_of(&view, &view.solids[0]).surface(part.face());
+            // Up to there, and up to there as to a light on the surface.
+            let short = Ray { reach: t.max(f64::MIN_POSITIVE), ..ray };
+            check(&short, &[]);
+            check(&short, &[surface]);
+            // From there, on and elsewhere, and along a leaf.
+            let origin = ray.origin + t * ray.direction;
+            let along = random_ray(random, solid, style).1;
+            for direction in [direction, random.direction(), along] {
+                check(&Ray { origin, direction, leaving: surface, ..ray }, &[]);
             }
         }
-        nodes[node].first_child
+        crossed
     }
-}
 
-/// The crossings of a leaf with the whole line of the ray: none or two.
-fn push_events(
-    events: &mut Vec<Event>,
-    view: &View<'_>,
-    leaf: &LeafRecord,
-    number: u32,
-    ray: &Ray,
-    ending_on: &[Surface],
-) {
-    // Of coordinates below 1, with the ray's own length on top.
-    let doubt_of = |t: f64, cosine: f64| {
-        4.0 * f64::EPSILON * (1.0 + ray.origin.abs().max_element() + t.abs()) / cosine.max(1e-12)
-    };
-    let ends_on = |surface: Surface| ending_on.contains(&surface);
-    if leaf.is_sphere() {
-        let center = DVec3::from_array(leaf.center);
-        let surface = Surface(leaf.surface);
-        let ends = if ray.leaving == surface {
-            let again = hit_sphere_again(ray, center);
-            [again.min(0.0), again.max(0.0)]
-        } else if ends_on(surface) {
-            let end = ray.reach;
-            let back = Ray { origin: ray.origin + end * ray.direction, ..*ray };
-            let again = end + hit_sphere_again(&back, center);
-            [again.min(end), again.max(end)]
-        } else {
-            match hit_sphere(ray, center, leaf.radius) {
-                Some(ends) => ends,
-                None => return,
-            }
-        };
-        let cosine = (ends[1] - ends[0]) / (2.0 * leaf.radius);
-        for t in ends {
-            let is_exact =
-                (ray.leaving == surface && t == 0.0) || (ends_on(surface) && t == ray.reach);
-            let doubt = if is_exact { 0.0 } else { doubt_of(t, cosine) };
-            events.push(Event { t, doubt, leaf: number, face: 0 });
-        }
-        return;
-    }
-    let nowhere = Event { t: f64::NEG_INFINITY, doubt: 0.0, leaf: number, face: 0 };
-    let (mut enter, mut leave) = (nowhere, Event { t: f64::INFINITY, ..nowhere });
-    for (face, &plane) in (0..).zip(&leaf.planes) {
-        let (distance, along) = plane_along(view, ray, plane);
-        let surface = plane.surface();
-        if along == 0.0 {
-            if distance < 0.0 {
-                return; // Outside, and never nearer.
-            }
-            continue;
-        }
-        let (t, doubt) = if ray.leaving == surface {
-            (0.0, 0.0)
-        } else if ends_on(surface) {
-            (ray.reach, 0.0)
-        } else {
-            let t = distance / along;
-            (t, doubt_of(t, along.abs()))
-        };
-        let event = Event { t, doubt, leaf: number, face };
-        if along < 0.0 && t > enter.t {
-            enter = event;
-        } else if along > 0.0 && t < leave.t {
-            leave = event;
-        }
-    }
-    if enter.t < leave.t {
-        events.extend([enter, leave]);
-    }
-}
+    const STYLES: [Style; 4] = [Style::Plain, Style::Grid, Style::Far, Style::Extreme];
 
-/// How far the face's plane is from the ray's start, and how fast the ray goes there, both along
-/// the face's outward normal.
-fn plane_along(view: &View<'_>, ray: &Ray, plane: PlaneIndex) -> (f64, f64) {
-    let record = &view.planes[plane.index()];
-    let normal = DVec3::from_array(record.normal) * plane.sign();
-    toward_plane(ray, DVec3::from_array(record.point), normal)
+    #[test]
+    fn what_is_passed_over_changes_no_bit() {
+        let mut crossed = 0;
+        for seed in 0..few_rays(8_000) as u64 {
+            let random = &mut random(seed);
+            let style = STYLES[seed as usize % 4];
+            let leaf_count = 2 + random.below(7) as u32;
+            let solid = random_solid(random, style, leaf_count, seed % 5 == 0);
+            crossed += check_solid(random, &solid, style, 15, &format!("{style:?} solid {seed}"));
+        }
+        eprintln!("{crossed} crossings of small solids");
+        assert!(crossed > 100_000);
+    }
+
+    #[test]
+    fn what_is_passed_over_in_large_and_deep_solids_changes_no_bit() {
+        let mut crossed = 0;
+        for seed in 0..few_rays(400) as u64 {
+            let random = &mut random(seed);
+            let style = STYLES[seed as usize % 4];
+            let leaf_count = random.log_uniform(9.0, 300.0) as u32;
+            let solid = random_solid(random, style, leaf_count, seed % 3 == 0);
+            let what = format!("{style:?} solid of {leaf_count}, {seed}");
+            crossed += check_solid(random, &solid, style, 20, &what);
+        }
+        eprintln!("{crossed} crossings of large solids");
+        assert!(crossed > 10_000);
+    }
 }

@@ -30,14 +30,15 @@ pub(super) enum Step {
     Enough,
 }
 
-/// Calls `meet` for the faces in the leaves that the ray enters, nearer boxes first.
+/// Calls `meet` for the items in the leaves that the ray enters, nearer boxes first, with the ray
+/// that meets boxes.
 #[inline(always)]
 pub(super) fn visit(
     kernel: impl BoxKernel,
     view: &View<'_>,
     ray: &Ray,
     stack: &mut Stack,
-    meet: impl FnMut(Item) -> Step,
+    meet: impl FnMut(Item, &BoxRay) -> Step,
 ) {
     visit_nodes(kernel, view, ray, stack, || (), meet);
 }
@@ -50,7 +51,7 @@ pub(super) fn visit_nodes(
     ray: &Ray,
     Stack(stack): &mut Stack,
     mut enter: impl FnMut(),
-    mut meet: impl FnMut(Item) -> Step,
+    mut meet: impl FnMut(Item, &BoxRay) -> Step,
 ) {
     let mut box_ray = BoxRay::new(ray.origin, ray.direction, ray.reach, &view.header.frame);
     let mut waiting = 0;
@@ -58,7 +59,7 @@ pub(super) fn visit_nodes(
     loop {
         if current.is_leaf() {
             for &item in &view.items[current.items()] {
-                match meet(item) {
+                match meet(item, &box_ray) {
                     Step::On(reach) => box_ray.shorten(reach),
                     Step::Enough => return,
                 }

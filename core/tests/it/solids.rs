@@ -11,7 +11,7 @@ use rtfarm_core::{
     language::read_scene,
     prepare::prepare,
     prepared::{PreparedBytes, PreparedScene},
-    scene::Scene,
+    scene::{Scene, SolidNode},
     testing::{Probe, ProbeHit, Probing},
 };
 use rtfarm_oracle::{
@@ -808,3 +808,103 @@ fn a_ray_that_starts_inside_solids_meets_what_the_oracle_meets() {
 
 /// Where scenes of the style [`Style::Far`] are.
 const FAR: DVec3 = DVec3::new(1e6, -2e6, 3e5);
+
+/// A shell with a die in it, all of it `scale` times its size, and a sphere at 1.
+fn tiny_solid(random: &mut Random, scale: f64, thickness: f64) -> Scene {
+    let turn = turn(random);
+    let place = random.in_cube();
+    let shell = join(
+        "difference",
+        &[&sphere(place, 2.0, "m"), &sphere(place, 2.0 * (1.0 - thickness), "m")],
+    );
+    let solid = join("union", &[&shell, &die(place, &turn, 1.4, 0.2)]);
+    let mut scene = read(&(solid + &sphere(DVec3::ONE, 0.1, "m")));
+    for node in &mut scene.solids[0].nodes {
+        match node {
+            SolidNode::Sphere(sphere) => {
+                sphere.center *= scale;
+                sphere.radius *= scale;
+            }
+            SolidNode::Parallelepiped(solid) => {
+                solid.corner *= scale;
+                solid.edges = solid.edges.map(|edge| edge * scale);
+            }
+            SolidNode::Operation { .. } => {}
+        }
+    }
+    scene
+}
+
+#[test]
+fn a_solid_of_a_billionth_of_its_scene_keeps_its_walls() {
+    let (scale, thickness) = (1e-9, 1e-6);
+    let mut counts = [0; 2];
+    for seed in 0..10 {
+        let mut random = random(seed);
+        let scene = tiny_solid(&mut random, scale, thickness);
+        let aim = |random: &mut Random, distance: f64| {
+            let target = random.in_cube() * 1.5 * scale;
+            probe(target + random.direction() * distance, target)
+        };
+        let probes: Vec<Probe> = (0..few_rays(100_000) / 50)
+            .map(|k| aim(&mut random, if k % 4 == 0 { 1.0 } else { 5.0 * scale }))
+            .collect();
+        add(&mut counts, compare_with_oracle(&scene, &probes, "a tiny solid"));
+        add(&mut counts, compare_leaving(&scene, &probes, &mut random, "leaving a tiny solid"));
+        // Straight in: both walls, whatever is behind them.
+        let block = PreparedScene::open(prepare(&scene).unwrap()).unwrap();
+        let SolidNode::Sphere(outside) = scene.solids[0].nodes[0] else { panic!("the shell") };
+        let straight: Vec<Probe> = (0..few_rays(10_000) / 10)
+            .map(|_| probe(outside.center + random.direction() * 5.0 * scale, outside.center))
+            .collect();
+        for (probe, hits) in straight.iter().zip(crossings(&block, &straight)) {
+            let wall = (hits[1].t - hits[0].t) / (2.0 * scale);
+            assert!((wall - thickness).abs() < 1e-14, "{probe:?}: a wall of {wall:e}");
+        }
+    }
+    let [same, close] = counts;
+    HardCase::TinySolid.tell(
+        "a solid of 1e-9 of its scene with walls of 1e-6 of it is met as the oracle says",
+        format!("{same} rays the same, {close} too close to call"),
+    );
+    assert!(close * 1000 < same);
+}
+
+/// A block less many balls that overlap. Nested, one is taken away after another, and every other
+/// one put back; else they are taken from the block at once.
+fn sponge(random: &mut Random, ball_count: usize, is_nested: bool) -> String {
+    let radius = 0.8 / (ball_count as f64).cbrt();
+    let balls = (0..ball_count).map(|_| sphere(random.in_cube(), radius, "other"));
+    let block = upright(DVec3::splat(-1.0), DVec3::splat(1.0), "m");
+    if !is_nested {
+        let parts: Vec<String> = std::iter::once(block).chain(balls).collect();
+        return join("difference", &parts.iter().map(String::as_str).collect::<Vec<_>>());
+    }
+    let mut whole = block;
+    for (k, balls) in balls.collect::<Vec<_>>().chunks(2).enumerate() {
+        let operation = ["difference", "union"][k % 2];
+        let parts: Vec<&str> = std::iter::once(&whole).chain(balls).map(String::as_str).collect();
+        whole = join(operation, &parts);
+    }
+    whole
+}
+
+#[test]
+fn a_solid_of_a_thousand_leaves_is_met_as_the_oracle_says_however_it_is_nested() {
+    let mut counts = [0; 2];
+    for is_nested in [false, true] {
+        let mut random = random(u64::from(is_nested));
+        let scene = read(&sponge(&mut random, 1000, is_nested));
+        let probes: Vec<Probe> = (0..few_rays(100_000) / 200)
+            .map(|_| probe(random.direction() * 5.0, random.in_cube()))
+            .collect();
+        add(&mut counts, compare_with_oracle(&scene, &probes, "a sponge"));
+        add(&mut counts, compare_leaving(&scene, &probes, &mut random, "leaving a sponge"));
+    }
+    let [same, close] = counts;
+    HardCase::LargeSolid.tell(
+        "a solid of 1001 leaves, flat or nested 500 deep, is met as the oracle says",
+        format!("{same} rays the same, {close} too close to call"),
+    );
+    assert!(same > few_rays(1_500) && close * 100 < same);
+}

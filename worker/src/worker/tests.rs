@@ -52,7 +52,7 @@ fn run(number: u64, count: u32, scene: u8) -> Answer {
 
 fn delivery(lease: LeaseName, tile: TileId) -> Delivery {
     let pixels = tile.number().to_le_bytes().to_vec().into();
-    Delivery { lease, tile, pixels, hash: [0; 32], tally: Tally::default(), seconds: 0.0 }
+    Delivery { lease, tile, pixels, hash: [0; 32], tally: Tally::default(), seconds: 1.0 }
 }
 
 fn no_answer() -> CallError {
@@ -102,6 +102,8 @@ impl Bench {
             threads,
             isa: rtfarm_core::isa::Isa::fastest(),
             version: "1".to_owned(),
+            build: String::new(),
+            reference: None,
             patience,
         };
         let now = start();
@@ -138,8 +140,18 @@ impl Bench {
     }
 
     fn join(&mut self, worker: u32) {
-        let joined = Answer::Joined { member: member(worker), farm: FarmId([7; 16]), term: TERM };
+        self.join_farm(worker, 1);
+    }
+
+    fn join_farm(&mut self, worker: u32, farm: u8) {
+        let joined =
+            Answer::Joined { member: member(worker), farm: FarmId([farm; 16]), term: TERM };
         self.answer(|call| matches!(call, Call::Join), joined);
+    }
+
+    /// A call that waits for its answer.
+    fn asked(&self, is_it: fn(&Call) -> bool) -> Call {
+        self.calls.values().find(|call| is_it(call)).expect("it is asked").clone()
     }
 
     /// Takes the worker's actions, and checks what always holds.
@@ -169,15 +181,31 @@ impl Bench {
             }
         }
         let at_hand = self.renderings.len() - self.stopped.len();
-        assert!(at_hand <= TILES_AT_HAND * self.threads, "{at_hand} tiles at hand");
+        let turn = self.turn();
+        assert!(at_hand <= TURNS_AT_HAND * turn * self.threads, "{at_hand} tiles at hand");
         let delivering = self.calls.values().filter(|call| is_deliver(call)).count();
-        assert!(delivering <= TILES_AHEAD * self.threads, "{delivering} tiles on their way");
+        assert!(delivering <= TURNS_AHEAD * self.threads, "{delivering} messages on their way");
         let deadline = self.worker.wake_at();
         assert!(self.calls.is_empty() || deadline.is_some(), "no call waits for ever");
         if self.exit.is_some() {
             assert!(self.calls.is_empty() && self.fetches.is_empty(), "nothing goes on");
             assert_eq!(self.renderings.len(), self.stopped.len(), "nothing goes on");
         }
+    }
+
+    /// The turn of a thread, in tiles.
+    fn turn(&self) -> usize {
+        if let Stage::Working(member) = &self.worker.stage { member.turn } else { 1 }
+    }
+
+    /// Tiles whose pixels are in memory or in the making.
+    fn pixels(&self) -> usize {
+        let delivered = self.calls.values().map(|call| match call {
+            Call::Deliver { tiles, .. } => tiles.len(),
+            _ => 0,
+        });
+        let Stage::Working(member) = &self.worker.stage else { panic!("it does not work") };
+        delivered.sum::<usize>() + member.rendered.len() + self.renderings.len()
     }
 
     fn find(&self, is_it: impl Fn(&Call) -> bool) -> TaskId {
@@ -223,14 +251,21 @@ impl Bench {
         let (&task, &(lease, tile)) = self.renderings.first_key_value().expect("a rendering");
         self.renderings.remove(&task);
         let pixels = (!self.stopped.remove(&task)).then(|| delivery(lease, tile));
-        self.worker.on_tile_rendered(task, pixels, self.now);
+        self.worker.on_tiles_rendered(vec![(task, pixels)], self.now);
         self.absorb();
         (lease, tile)
     }
 
-    /// A sign of progress under a lease.
+    /// A step that brings the scene of a lease.
     fn beat(&mut self, number: u64) {
-        self.worker.on_beat(&BTreeMap::from([(lease(number), 1)]), self.now);
+        self.worker.on_beat(&BTreeMap::from([((lease(number), None), 1)]), self.now);
+        self.absorb();
+    }
+
+    /// A step for a tile of a lease.
+    fn step(&mut self, number: u64, tile: u32) {
+        let tile = grid().tile(tile);
+        self.worker.on_beat(&BTreeMap::from([((lease(number), tile), 1)]), self.now);
         self.absorb();
     }
 
@@ -253,13 +288,14 @@ fn a_tile_goes_from_its_lease_to_its_delivery() {
     assert_eq!(bench.beat_period, Some(TERM / 4));
     let asked = bench.answer(is_lease, run(1, 1, 0));
     let (member, wait) = (member(1), LONGEST_WAIT);
-    assert_eq!(asked, Call::Lease { member, most_tiles: LONGEST_RUN_A_THREAD, wait });
+    let most_tiles = LONGEST_RUN_A_THREAD;
+    assert_eq!(asked, Call::Lease { member, most_tiles, wait, kept: None });
     assert!(bench.calls.is_empty(), "nothing is asked for while a scene is fetched");
     bench.fetch();
     assert!(bench.has(is_lease), "one tile is too few to go on with");
     let (name, tile) = bench.render();
     let delivered = bench.answer(is_deliver, Answer::Delivered);
-    assert_eq!(delivered, Call::Deliver { member, tile: delivery(name, tile) });
+    assert_eq!(delivered, Call::Deliver { member, tiles: vec![delivery(name, tile)] });
     assert!(!bench.has(is_deliver));
 }
 
@@ -269,7 +305,7 @@ fn tiles_are_asked_for_before_the_threads_run_dry() {
     for left in (0..9).rev() {
         bench.render();
         bench.answer(is_deliver, Answer::Delivered);
-        assert_eq!(bench.has(is_lease), left < TILES_AHEAD * 2, "{left} tiles left");
+        assert_eq!(bench.has(is_lease), left < TURNS_AHEAD * 2, "{left} tiles left");
     }
 }
 
@@ -294,17 +330,64 @@ fn slow_deliveries_stop_the_threads_and_the_asking() {
         bench.render();
         rendered += 1;
     }
-    assert_eq!(rendered, MOST_TILES_OF_PIXELS);
+    assert_eq!(rendered, MOST_TURNS_OF_PIXELS);
     assert!(!bench.has(is_lease));
     bench.answer(is_deliver, Answer::Delivered);
     assert_eq!(bench.renderings.len(), 1, "one out, one in");
 }
 
 #[test]
+fn small_tiles_are_handed_on_and_delivered_together() {
+    let mut bench = Bench::rendering(1, 100);
+    let rendered = |bench: &mut Bench, count: usize| -> Vec<Delivery> {
+        let begun: Vec<_> = (0..count).filter_map(|_| bench.renderings.pop_first()).collect();
+        let small = |&(_, (lease, tile))| Delivery {
+            seconds: TURN.as_secs_f64() / 4.5,
+            ..delivery(lease, tile)
+        };
+        let tiles: Vec<Delivery> = begun.iter().map(small).collect();
+        let rendered =
+            begun.iter().zip(&tiles).map(|(&(task, _), tile)| (task, Some(tile.clone())));
+        bench.worker.on_tiles_rendered(rendered.collect(), bench.now);
+        tiles
+    };
+    let first = rendered(&mut bench, 1);
+    assert_eq!(bench.turn(), 4);
+    bench.absorb();
+    assert_eq!(bench.renderings.len(), 4 * TURNS_AT_HAND);
+    let more = rendered(&mut bench, 7);
+    bench.absorb();
+    for tiles in [first, more] {
+        let expected = Call::Deliver { member: member(1), tiles };
+        assert_eq!(bench.answer(is_deliver, Answer::Delivered), expected);
+    }
+    while !bench.renderings.is_empty() {
+        rendered(&mut bench, 4);
+        bench.absorb();
+    }
+    assert_eq!(bench.pixels(), 4 * MOST_TURNS_OF_PIXELS, "slow deliveries stop the threads");
+}
+
+#[test]
+fn a_message_holds_so_many_bytes_and_no_more() {
+    let mut bench = Bench::rendering(1, 3);
+    let big = |(lease, tile)| Delivery {
+        pixels: vec![0; DELIVERY_BYTES / 2].into(),
+        ..delivery(lease, tile)
+    };
+    let begun = std::mem::take(&mut bench.renderings);
+    let rendered = begun.into_iter().map(|(task, tile)| (task, Some(big(tile))));
+    bench.worker.on_tiles_rendered(rendered.collect(), bench.now);
+    bench.absorb();
+    let Call::Deliver { tiles, .. } = bench.answer(is_deliver, Answer::Delivered) else { panic!() };
+    assert_eq!(tiles.len(), 2);
+}
+
+#[test]
 fn pixels_are_kept_until_they_are_acknowledged() {
     let mut bench = Bench::rendering(1, 1);
     let (name, tile) = bench.render();
-    let expected = Call::Deliver { member: member(1), tile: delivery(name, tile) };
+    let expected = Call::Deliver { member: member(1), tiles: vec![delivery(name, tile)] };
     for _ in 0..5 {
         assert_eq!(bench.fail(is_deliver, no_answer()), expected);
         assert!(!bench.has(is_deliver), "not at once");
@@ -317,20 +400,31 @@ fn pixels_are_kept_until_they_are_acknowledged() {
 }
 
 #[test]
-fn progress_renews_its_own_lease_one_renewal_at_a_time() {
-    let mut bench = Bench::rendering(1, 1);
+fn progress_is_told_tile_by_tile_one_renewal_at_a_time() {
+    let mut bench = Bench::rendering(2, 2);
     bench.answer(is_lease, run(2, 9, 0));
     assert!(!bench.has(is_renew), "time alone renews nothing");
-    bench.beat(1);
-    bench.beat(1);
+    bench.step(1, 0);
+    bench.step(1, 0);
+    bench.step(1, 1);
     bench.beat(2);
-    for works in [[1, 0], [2, 1]] {
+    let mut check_renewal = |expected: [(u64, &[(u32, u64)]); 2]| {
         let renewed = bench.answer(is_renew, Answer::Renewed { lost: vec![] });
-        let renewal = |(number, work)| Renewal { lease: lease(number), work };
-        let renewals = (1..).zip(works).map(renewal).collect();
-        assert_eq!(renewed, Call::Renew { member: member(1), renewals });
-    }
+        let renewals = (1..).zip(expected).map(|(number, (work, tiles))| Renewal {
+            lease: lease(number),
+            work,
+            tiles: tiles.to_vec(),
+        });
+        assert_eq!(renewed, Call::Renew { member: member(1), renewals: renewals.collect() });
+    };
+    check_renewal([(0, &[(0, 1)]), (0, &[])]);
+    check_renewal([(0, &[(0, 2), (1, 1)]), (1, &[])]);
     assert!(!bench.has(is_renew), "nothing new to tell");
+    bench.render();
+    bench.step(1, 1);
+    let renewed = bench.answer(is_renew, Answer::Renewed { lost: vec![] });
+    let Call::Renew { renewals, .. } = renewed else { panic!("{renewed:?}") };
+    assert_eq!(renewals[0].tiles, [(1, 2)], "what is on its way is told no more");
 }
 
 #[test]
@@ -349,12 +443,12 @@ fn a_lost_lease_is_rendered_no_further_but_its_pixels_are_delivered() {
     let (name, tile) = bench.render();
     bench.beat(1);
     bench.answer(is_renew, Answer::Renewed { lost: vec![lease(1)] });
-    assert_eq!(bench.stopped.len(), TILES_AT_HAND);
+    assert_eq!(bench.stopped.len(), TURNS_AT_HAND);
     while !bench.renderings.is_empty() {
         bench.render();
     }
     let delivered = bench.answer(is_deliver, Answer::Delivered);
-    assert_eq!(delivered, Call::Deliver { member: member(1), tile: delivery(name, tile) });
+    assert_eq!(delivered, Call::Deliver { member: member(1), tiles: vec![delivery(name, tile)] });
     assert!(!bench.has(is_deliver) && bench.has(is_lease));
 }
 
@@ -445,7 +539,7 @@ fn a_forgotten_worker_stops_everything_and_joins_again() {
     assert_eq!(bench.stopped.len(), bench.renderings.len());
     assert!(bench.scenes.is_empty());
     assert_eq!(bench.calls.values().collect::<Vec<_>>(), [&Call::Join]);
-    bench.join(2);
+    bench.join_farm(2, 2);
     bench.worker.on_answer(late, Answer::Delivered, bench.now);
     while !bench.renderings.is_empty() {
         bench.render();
@@ -466,7 +560,7 @@ fn a_coordinator_started_anew_gets_no_pixel_that_was_rendered_for_the_last() {
     // One delivery is repeated, one is on its way, when the coordinator says that it is another.
     bench.fail(is_deliver, no_answer());
     bench.fail(is_deliver, failure(CallErrorKind::NotMember));
-    bench.join(2);
+    bench.join_farm(2, 2);
     while !bench.renderings.is_empty() {
         bench.render();
     }
@@ -474,6 +568,35 @@ fn a_coordinator_started_anew_gets_no_pixel_that_was_rendered_for_the_last() {
     while bench.exit.is_none() {
         assert!(!bench.has(is_deliver) && !bench.has(is_renew));
         bench.sleep();
+    }
+}
+
+#[test]
+fn finished_tiles_are_delivered_to_the_same_farm_under_a_new_lease() {
+    for is_same in [true, false] {
+        let mut bench = Bench::rendering(2, 9);
+        let ((_, first), (_, second)) = (bench.render(), bench.render());
+        bench.fail(is_deliver, no_answer());
+        bench.fail(is_deliver, failure(CallErrorKind::NotMember));
+        bench.join_farm(2, if is_same { 1 } else { 2 });
+        let Call::Lease { kept, .. } = bench.asked(is_lease) else { unreachable!() };
+        let mut tiles = vec![first, second];
+        tiles.sort();
+        let offered = KeptTiles { job: JobId(1), tiles };
+        assert_eq!(kept, is_same.then_some(offered));
+
+        // One of them was leased to another meanwhile.
+        let run = Run { lease: lease(7), tiles: vec![second], job: job(0) };
+        bench.answer(is_lease, Answer::Leased(Next::Run(run)));
+        if is_same {
+            let Call::Deliver { tiles, .. } = bench.asked(is_deliver) else { unreachable!() };
+            assert_eq!(tiles, [delivery(lease(7), second)]);
+            let Call::Lease { kept, .. } = bench.asked(is_lease) else { unreachable!() };
+            assert_eq!(kept, None);
+            assert!(bench.fetches.is_empty(), "nothing is to be rendered");
+        } else {
+            assert!(!bench.has(is_deliver) && bench.fetches.len() == 1, "it is rendered anew");
+        }
     }
 }
 
@@ -523,6 +646,8 @@ fn workers_do_not_all_ask_again_at_once() {
         threads: 1,
         isa: rtfarm_core::isa::Isa::fastest(),
         version: "1".to_owned(),
+        build: String::new(),
+        reference: None,
         patience: PATIENCE,
     };
     let now = start();
@@ -615,7 +740,7 @@ fn a_worker_that_is_drained_delivers_what_its_threads_have_and_leaves() {
         count += 1;
         bench.answer(is_deliver, Answer::Delivered);
     }
-    assert_eq!(count, TILES_AT_HAND, "no tile is begun any more");
+    assert_eq!(count, TURNS_AT_HAND, "no tile is begun any more");
     bench.answer(|call| matches!(call, Call::Leave { .. }), Answer::Left);
     assert_eq!(bench.exit, Some(Ok(())));
 }
@@ -730,10 +855,12 @@ impl Chance {
                 let lost = leases.into_iter().filter(|name| !known.contains_key(name)).collect();
                 Ok(Answer::Renewed { lost })
             }
-            Call::Deliver { tile, .. } => {
-                if let Some((scene, tiles)) = self.leases.get_mut(&tile.lease) {
-                    tiles.remove(&tile.tile);
-                    self.delivered.insert((*scene, tile.tile));
+            Call::Deliver { tiles, .. } => {
+                for tile in tiles {
+                    if let Some((scene, tiles)) = self.leases.get_mut(&tile.lease) {
+                        tiles.remove(&tile.tile);
+                        self.delivered.insert((*scene, tile.tile));
+                    }
                 }
                 Ok(Answer::Delivered)
             }
@@ -838,10 +965,10 @@ fn simulate(seed: u64) {
             Letter::Rendered(task) => {
                 let (lease, tile) = bench.renderings.remove(&task).unwrap();
                 let pixels = (!bench.stopped.remove(&task)).then(|| delivery(lease, tile));
-                bench.worker.on_tile_rendered(task, pixels, bench.now);
+                bench.worker.on_tiles_rendered(vec![(task, pixels)], bench.now);
             }
             Letter::Beat(lease) => {
-                bench.worker.on_beat(&BTreeMap::from([(lease, 1)]), bench.now);
+                bench.worker.on_beat(&BTreeMap::from([((lease, None), 1)]), bench.now);
             }
         }
         bench.absorb();

@@ -1,0 +1,165 @@
+//! What a farm's state says of a job and of the farm, as it stands in files.
+
+use prost::Message;
+use rtfarm_core::{
+    prepared::SceneHash,
+    render::{Settings, Tally},
+    tile::{Crop, TileGrid, TileSideError},
+    transfer::Transfer,
+};
+use rtfarm_job::{Outcome, Progress};
+use rtfarm_picture::PictureFormat;
+use rtfarm_proto::{
+    WireError, scene_hash, transfer,
+    wire::{self, event},
+};
+
+/// What a file begins with that holds a record; then comes the record's hash, then the record.
+const MAGIC: [u8; 8] = *b"rtfarm 1";
+
+/// A farm.
+#[derive(Clone, PartialEq, Message)]
+pub(crate) struct FarmRecord {
+    /// 16 random bytes.
+    #[prost(bytes = "vec", tag = "1")]
+    pub(crate) farm: Vec<u8>,
+    /// The last number that was given to a job.
+    #[prost(uint64, tag = "2")]
+    pub(crate) last_job: u64,
+}
+
+/// A job. A field that is added later has its default in records that lack it.
+#[derive(Clone, PartialEq, Message)]
+pub(crate) struct JobRecord {
+    /// What its scene is called in logs.
+    #[prost(string, tag = "1")]
+    pub(crate) name: String,
+    /// The build that prepared its scene and renders it; to another one both may be something else.
+    #[prost(string, tag = "2")]
+    pub(crate) build: String,
+    /// What workers are told of it.
+    #[prost(message, optional, tag = "3")]
+    pub(crate) job: Option<wire::Job>,
+    #[prost(enumeration = "wire::Format", tag = "4")]
+    pub(crate) format: i32,
+    #[prost(enumeration = "wire::Transfer", tag = "5")]
+    pub(crate) transfer: i32,
+    /// How far it was at its end, once it has ended.
+    #[prost(message, optional, tag = "6")]
+    pub(crate) end: Option<wire::Event>,
+}
+
+/// What a job renders.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Plan {
+    pub(crate) scene: SceneHash,
+    pub(crate) scene_byte_count: u64,
+    pub(crate) settings: Settings,
+    pub(crate) grid: TileGrid,
+    pub(crate) format: PictureFormat,
+    pub(crate) transfer: Transfer,
+}
+
+/// Why a record says nothing.
+#[derive(Debug, thiserror::Error)]
+pub(crate) enum RecordError {
+    #[error("it is no record of a farm")]
+    Foreign,
+    #[error("its bytes are not those that were written")]
+    Damaged,
+    #[error(transparent)]
+    Wire(#[from] WireError),
+    #[error(transparent)]
+    TileSide(#[from] TileSideError),
+    #[error(transparent)]
+    Message(#[from] prost::DecodeError),
+}
+
+/// The bytes of a file that holds a record.
+pub(crate) fn seal(record: &impl Message) -> Vec<u8> {
+    let record = record.encode_to_vec();
+    [&MAGIC[..], blake3::hash(&record).as_bytes(), &record].concat()
+}
+
+/// Reads the bytes of a file that holds a record.
+pub(crate) fn unseal<M: Message + Default>(bytes: &[u8]) -> Result<M, RecordError> {
+    let sealed = bytes.strip_prefix(&MAGIC).ok_or(RecordError::Foreign)?;
+    let (hash, record) = sealed.split_at_checked(32).ok_or(RecordError::Damaged)?;
+    if blake3::hash(record) != *<&[u8; 32]>::try_from(hash).expect("32 bytes") {
+        return Err(RecordError::Damaged);
+    }
+    Ok(M::decode(record)?)
+}
+
+impl JobRecord {
+    pub(crate) fn new(name: String, build: &str, plan: &Plan) -> Self {
+        let &Plan { scene, scene_byte_count, settings, grid, format, transfer } = plan;
+        let job = wire::Job {
+            scene_hash: scene.0.to_vec().into(),
+            scene_bytes: scene_byte_count,
+            scene_path: String::new(),
+            settings: Some(settings.into()),
+            tile_side: grid.side(),
+            window: Some(Crop::from(grid.window()).into()),
+        };
+        Self {
+            name,
+            build: build.to_owned(),
+            job: Some(job),
+            format: wire::Format::from(format).into(),
+            transfer: wire::Transfer::from(transfer).into(),
+            end: None,
+        }
+    }
+
+    pub(crate) fn plan(&self) -> Result<Plan, RecordError> {
+        let job = self.job.as_ref().ok_or(WireError::Missing("job"))?;
+        let settings: Settings = job.settings.ok_or(WireError::Missing("settings"))?.try_into()?;
+        let window = Crop::from(job.window.ok_or(WireError::Missing("window"))?);
+        let window = window.of(settings.size).map_err(WireError::from)?;
+        Ok(Plan {
+            scene: scene_hash(&job.scene_hash)?,
+            scene_byte_count: job.scene_bytes,
+            settings,
+            grid: TileGrid::new(window, job.tile_side.into())?,
+            format: self.format().try_into()?,
+            transfer: transfer(self.transfer)?,
+        })
+    }
+}
+
+/// How far a job is, for those who watch it and for its record.
+pub(crate) fn to_event(progress: &Progress) -> wire::Event {
+    wire::Event {
+        tiles_done: progress.tiles_done,
+        tile_count: progress.tile_count,
+        tally: Some(progress.tally.into()),
+        workers: progress.worker_count,
+        differing_tiles: progress.differing_tiles,
+        end: progress.outcome.as_ref().map(|outcome| match outcome {
+            Outcome::Finished(time) => {
+                event::End::Finished(wire::Finished { seconds: time.as_secs_f64() })
+            }
+            Outcome::Failed(reason) => event::End::Failed(reason.clone()),
+        }),
+    }
+}
+
+/// How far a job was according to its record.
+pub(crate) fn to_progress(event: &wire::Event) -> Result<Progress, RecordError> {
+    let outcome = event.end.as_ref().map(|end| match end {
+        event::End::Finished(wire::Finished { seconds }) => {
+            Outcome::Finished(std::time::Duration::try_from_secs_f64(*seconds).unwrap_or_default())
+        }
+        event::End::Failed(reason) => Outcome::Failed(reason.clone()),
+    });
+    Ok(Progress {
+        tiles_done: event.tiles_done,
+        tile_count: event.tile_count,
+        tally: Tally::try_from(event.tally.unwrap_or_default())?,
+        worker_count: event.workers,
+        differing_tiles: event.differing_tiles,
+        outcome,
+        ..Progress::default()
+    })
+}
