@@ -1,5 +1,7 @@
 //! Where in its pixel a sample lies.
 
+use sobol_burley::parts::{hash, owen_scramble_rev, u32_to_f32_norm};
+
 /// The most samples that a pixel may have.
 pub const MOST_SAMPLES: u32 = 1 << 16;
 
@@ -53,7 +55,7 @@ impl Sample {
         if self.is_alone {
             return [0.5; 2];
         }
-        self.numbers(0, self.key)
+        self.pair(self.key)
     }
 
     /// Its place in the frame, in pixels, where the pixel is (x, y).
@@ -75,11 +77,9 @@ impl Sample {
         self.gather_numbers(u64::from(depth)).choice()
     }
 
-    fn numbers<const N: usize>(&self, first_dimension: u32, key: u64) -> [f64; N] {
-        let scramble = (key >> 32) as u32;
-        std::array::from_fn(|k| {
-            f64::from(sobol_burley::sample(self.index, first_dimension + k as u32, scramble))
-        })
+    /// The first two dimensions of the sequence of a key.
+    fn pair(&self, key: u64) -> [f64; 2] {
+        sobol_pair(self.index, (key >> 32) as u32).map(f64::from)
     }
 }
 
@@ -95,13 +95,13 @@ impl GatherNumbers {
 
     /// What it aims at. A choice among many needs more than the 23 bits of a number.
     pub(crate) fn choice(&self) -> f64 {
-        let [choice] = self.0.numbers(2, self.0.key);
-        choice + self.fraction(0) * (1.0 / f64::from(1 << 23))
+        let choice = sobol_burley::sample(self.0.index, 2, (self.0.key >> 32) as u32);
+        f64::from(choice) + self.fraction(0) * (1.0 / f64::from(1 << 23))
     }
 
     /// Its direction.
     pub(crate) fn direction(&self) -> [f64; 2] {
-        self.0.numbers(0, self.0.key)
+        self.0.pair(self.0.key)
     }
 
     /// A number of 52 bits, spread no better than by chance.
@@ -109,6 +109,25 @@ impl GatherNumbers {
         let bits = mix(self.0.key ^ u64::from(self.0.index) ^ purpose << 32) >> 12;
         bits as f64 * (1.0 / (1_u64 << 52) as f64)
     }
+}
+
+/// Finds the first two dimensions of a point of Sobol's sequence, scrambled by `seed`: what
+/// [`sobol_burley::sample`] gives for them, in a fourth of its instructions. The index is shuffled
+/// once for both, and no table of directions is gone through: the first dimension is the index with
+/// its bits reversed, the second its product with Pascal's triangle modulo 2, whose columns double
+/// in four steps.
+fn sobol_pair(index: u32, seed: u32) -> [f32; 2] {
+    let shuffled =
+        owen_scramble_rev(index.reverse_bits(), hash(seed ^ 0x79c6_8e4a)).reverse_bits() & 0xffff;
+    let mut pascal = shuffled;
+    for (step, columns) in [(1, 0xaaaa), (2, 0xcccc), (4, 0xf0f0), (8, 0xff00)] {
+        pascal ^= (pascal & columns) >> step;
+    }
+    let seed = seed.wrapping_mul(0x9c8f_2d3b);
+    let scrambled = |sobol, dimension| {
+        u32_to_f32_norm(owen_scramble_rev(sobol, hash(seed ^ dimension)).reverse_bits())
+    };
+    [scrambled(shuffled, 0x912f_69ba), scrambled(pascal, 0x174f_18ab)]
 }
 
 /// The number of a branch that leaves the place of number `node`.
@@ -140,6 +159,16 @@ mod tests {
                     cells[(x * 4.0) as usize * 4 + (y * 4.0) as usize] += 1;
                 }
                 assert_eq!(cells, [1; 16], "pixel {pixel}, run {run}");
+            }
+        }
+    }
+
+    #[test]
+    fn pairs_are_the_first_two_dimensions() {
+        for index in (0..300).chain((300..MOST_SAMPLES).step_by(251)) {
+            for seed in [0, 1, 0xffff_ffff, 0x1234_5678, index.wrapping_mul(0x9e37_79b9)] {
+                let both = [0, 1].map(|dimension| sobol_burley::sample(index, dimension, seed));
+                assert_eq!(sobol_pair(index, seed), both, "{index}, {seed:#x}");
             }
         }
     }

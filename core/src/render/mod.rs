@@ -1,9 +1,9 @@
 //! A tile of a prepared scene into pixels.
 //!
 //! A pixel's samples are added in their own order, and each is a pure function of (scene,
-//! quality, pixel, sample); how many there are hangs on the first samples of the pixel and its
-//! eight neighbours, on the faces in its beam, and on its own later samples. So a pixel is the same
-//! to the bit whatever the tile, the batch, the thread or the CPU.
+//! quality, pixel, sample); how many there are hangs on the first samples of the pixels at most three
+//! away and the first eight of those beside it, on the faces in its beam, and on its own later
+//! samples. So a pixel is the same to the bit whatever the tile, the batch, the thread or the CPU.
 
 mod pixel;
 mod sampler;
@@ -58,12 +58,10 @@ fn render<B: AsRef<[u8]>>(
     let mut sampler = Sampler::new(&view, quality, isa, Wavefront::new(cutoff), on_progress);
     let ControlFlow::Continue(pixels) = sampler.sample(area) else { return None };
     let mut tally = sampler.tally();
-    for pixel in &pixels {
-        if let Some(variance) = pixel.variance() {
-            tally.estimated += 1;
-            tally.variance += (variance.x + variance.y + variance.z) / 3.0;
-        }
+    for variance in pixels.iter().filter_map(|pixel| pixel.variance) {
+        tally.estimated += 1;
+        tally.variance += (variance.x + variance.y + variance.z) / 3.0;
     }
-    let pixels = pixels.iter().map(|pixel| pixel.mean().to_array().map(|x| x as f32)).collect();
+    let pixels = pixels.iter().map(|pixel| pixel.mean.to_array().map(|x| x as f32)).collect();
     Some(RenderedTile { pixels, tally })
 }

@@ -1,11 +1,11 @@
 //! How many samples pixels get, and when.
 
-use std::ops::ControlFlow;
+use std::ops::{ControlFlow, Range};
 
 use glam::DVec3;
 
 use super::{
-    pixel::Pixel,
+    pixel::{Estimate, Neighbourhood, Pixel, Runs},
     settings::{Quality, Sampling},
     tally::Tally,
     unseen::{FirstSamples, UnseenFaces, UnseenSearch},
@@ -50,7 +50,7 @@ impl<'a> Sampler<'a> {
     }
 
     /// Gives the pixels of `area` all their samples. `Break` when the work was stopped.
-    pub(super) fn sample(&mut self, area: Area) -> ControlFlow<(), Vec<Pixel>> {
+    pub(super) fn sample(&mut self, area: Area) -> ControlFlow<(), Vec<Estimate>> {
         match self.quality.sampling {
             Sampling::Fixed(count) => self.sample_evenly(area, count.get()),
             Sampling::Adaptive { error, most } => {
@@ -60,172 +60,204 @@ impl<'a> Sampler<'a> {
     }
 
     /// The pixels of `area` with `count` samples each.
-    fn sample_evenly(&mut self, area: Area, count: u32) -> ControlFlow<(), Vec<Pixel>> {
-        let mut pixels = vec![Pixel::default(); area.pixel_count()];
-        let all: Vec<u32> = (0..pixels.len() as u32).collect();
-        self.extend(area, &mut pixels, &all, count, None)?;
-        ControlFlow::Continue(pixels)
+    fn sample_evenly(&mut self, area: Area, count: u32) -> ControlFlow<(), Vec<Estimate>> {
+        let all: Vec<u32> = (0..area.pixel_count() as u32).collect();
+        let mut pixels = vec![Runs::default(); all.len()];
+        self.extend(area, &all, 0..count, count, None, |pixel, color| pixels[pixel].add(color))?;
+        ControlFlow::Continue(pixels.iter().map(Runs::estimate).collect())
     }
 
-    /// The pixels of `area` with samples until each one's standard error is below `error`.
+    /// The pixels of `area` with samples until each one's standard error is below `error`: one each
+    /// at first, more where the neighbourhood's samples or the faces in the beam ask for them.
     fn sample_as_needed(
         &mut self,
         area: Area,
         error: f64,
         most: u32,
-    ) -> ControlFlow<(), Vec<Pixel>> {
-        let wide = area.with_rim();
-        let inner: Vec<u32> = area.pixels().map(|(x, y)| wide.index_of(x, y)).collect();
-        let mut pixels = vec![Pixel::default(); wide.pixel_count()];
-        let all: Vec<u32> = (0..pixels.len() as u32).collect();
-        let mut hits = Vec::with_capacity(all.len() * FEWEST_FOR_ERROR as usize);
-        self.extend(wide, &mut pixels, &all, FEWEST_FOR_ERROR, Some(&mut hits))?;
-
-        // What one pixel's first samples missed its neighbours' may have found.
-        let contrasts: Vec<DVec3> = inner
-            .iter()
-            .map(|&pixel| {
-                let ranges = neighbourhood(wide, pixel).map(|k| pixels[k as usize].range());
-                let range = ranges.reduce(|a, b| [a[0].min(b[0]), a[1].max(b[1])]);
-                let [low, high] = range.expect("a pixel is its own neighbour");
-                high - low
-            })
-            .collect();
-        for (&pixel, contrast) in inner.iter().zip(contrasts) {
-            pixels[pixel as usize].set_contrast(contrast);
-        }
-        let quality = self.quality;
-        let search = UnseenSearch::new(self.view, area.frame(), quality.flat, error);
-        let mut watch = match search {
-            Some(search) => self.find_unseen(search, area, wide, &mut pixels, &hits)?,
-            None => UnseenWatch::default(),
+    ) -> ControlFlow<(), Vec<Estimate>> {
+        let near = area.with_rim();
+        let far = near.with_rim();
+        let wide = far.with_rim();
+        let all: Vec<u32> = (0..wide.pixel_count() as u32).collect();
+        let (mut colors, mut hits) = (Vec::with_capacity(all.len()), Vec::with_capacity(all.len()));
+        self.extend(wide, &all, 0..1, FEWEST_FOR_ERROR, Some(&mut hits), |_, color| {
+            colors.push(color);
+        })?;
+        let (flat, seed) = (self.quality.flat, self.quality.seed);
+        let mut search = UnseenSearch::new(self.view, area.frame(), flat, error);
+        let found = match &mut search {
+            Some(search) => self.find_unseen(search, area, wide, &colors, &hits)?,
+            None => Vec::new(),
         };
         drop(hits);
-        let is_open = |pixels: &[Pixel], pixel: u32| !pixels[pixel as usize].is_below(error);
-        let mut open = inner.clone();
-        open.retain(|&pixel| is_open(&pixels, pixel));
-        let mut count = FEWEST_FOR_ERROR;
+
+        // Where the first samples lie apart the pixels around get more, and what these see opens the
+        // pixels beside them: an edge may cross a corner that no first sample met.
+        let new_pixel = |(x, y)| {
+            let first = colors[wide.index_of(x, y) as usize];
+            Pixel::new(first, &Neighbourhood::new(wide, x, y, &colors))
+        };
+        let mut pixels: Vec<Pixel> = far.pixels().map(new_pixel).collect();
+        drop(colors);
+        let is_open = |&(x, y): &(u32, u32)| {
+            let mut around = neighbours(far, x, y).map(|index| &pixels[index as usize]);
+            !pixels[far.index_of(x, y) as usize].is_below(error)
+                || around.any(|pixel| pixel.is_suspect(error))
+        };
+        let chosen: Vec<u32> =
+            near.pixels().filter(is_open).map(|(x, y)| far.index_of(x, y)).collect();
+        self.extend(far, &chosen, 1..FEWEST_FOR_ERROR, FEWEST_FOR_ERROR, None, |place, color| {
+            pixels[chosen[place] as usize].add(color);
+        })?;
+        let mut found = found.into_iter().peekable();
+        let mut estimates = Vec::with_capacity(area.pixel_count());
+        let mut open = Vec::new();
+        for (index, (x, y)) in (0..).zip(area.pixels()) {
+            let mut pixel = pixels[far.index_of(x, y) as usize];
+            let ranges = neighbours(far, x, y).map(|index| pixels[index as usize].range());
+            pixel.set_contrast(ranges);
+            let unseen = found.next_if(|&(at, _)| at == index).map(|(_, unseen)| unseen);
+            let mut pixel = OpenPixel { index, pixel, unseen };
+            pixel.note_samples(search.as_ref(), area, seed, 1);
+            estimates.push(pixel.pixel.estimate());
+            if !pixel.pixel.is_below(error) {
+                open.push(pixel);
+            }
+        }
+        drop(pixels);
+
+        let mut count = 1;
         while !open.is_empty() && count < most {
-            count = most.min(2 * count);
-            self.extend(wide, &mut pixels, &open, count, None)?;
-            watch.note_samples(wide, &mut pixels, quality.seed);
-            open.retain(|&pixel| is_open(&pixels, pixel));
+            let next = most.min((2 * count).max(FEWEST_FOR_ERROR));
+            let mut behind: Vec<&mut OpenPixel> =
+                open.iter_mut().filter(|open| open.pixel.count() == count).collect();
+            let chosen: Vec<u32> = behind.iter().map(|open| open.index).collect();
+            self.extend(area, &chosen, count..next, next, None, |place, color| {
+                behind[place].pixel.add(color);
+            })?;
+            for open in behind {
+                open.note_samples(search.as_ref(), area, seed, count);
+                estimates[open.index as usize] = open.pixel.estimate();
+            }
+            open.retain(|open| !open.pixel.is_below(error));
+            count = next;
         }
         self.tally.capped += open.len() as u64;
-        ControlFlow::Continue(inner.iter().map(|&pixel| pixels[pixel as usize]).collect())
+        ControlFlow::Continue(estimates)
     }
 
-    /// Finds the faces in the pixels of `area` that none of the first samples has met; `hits` has
-    /// what the samples of `wide` met.
+    /// Finds the faces in the pixels of `area` that none of the first samples has met: for some
+    /// pixels, by their places in `area`, in order. `colors` and `hits` are what these samples, one in
+    /// each pixel of `wide`, saw and met.
     fn find_unseen(
         &mut self,
-        mut search: UnseenSearch<'a>,
+        search: &mut UnseenSearch<'a>,
         area: Area,
         wide: Area,
-        pixels: &mut [Pixel],
+        colors: &[DVec3],
         hits: &[Hit],
-    ) -> ControlFlow<(), UnseenWatch<'a>> {
+    ) -> ControlFlow<(), Vec<(u32, UnseenFaces)>> {
         let seed = self.quality.seed;
         let mut found = Vec::new();
         for block in area.blocks(32) {
             (self.on_progress)()?;
             let first_samples = |x: u32, y: u32| {
-                let pixel = wide.index_of(x, y);
-                let first = pixel as usize * FEWEST_FOR_ERROR as usize;
+                let pixel = wide.index_of(x, y) as usize;
                 FirstSamples {
-                    hits: &hits[first..first + FEWEST_FOR_ERROR as usize],
+                    hits: &hits[pixel..=pixel],
                     samples: Samples::new(FEWEST_FOR_ERROR, seed, x, y),
-                    mean: pixels[pixel as usize].mean(),
+                    mean: colors[pixel],
                 }
             };
             search.search(block, &first_samples, &mut |x, y, unseen| {
-                found.push((wide.index_of(x, y), FEWEST_FOR_ERROR, unseen));
+                found.push((area.index_of(x, y), unseen));
             });
         }
-        for (pixel, count, unseen) in &found {
-            pixels[*pixel as usize].set_unseen(unseen.variance(*count));
-        }
-        ControlFlow::Continue(UnseenWatch { search: Some(search), found })
+        found.sort_unstable_by_key(|&(index, _)| index);
+        ControlFlow::Continue(found)
     }
 
-    /// Brings the `chosen` ones among the pixels of `area`, which all have as many samples, to
-    /// `count` samples each; `hits` takes what the new camera rays meet.
+    /// Gives each of the `chosen` pixels of `area` the samples of these numbers, out of `count`;
+    /// `add` takes what each sees, with the pixel's place among the chosen ones and in the order of
+    /// numbers, and `hits` what its camera ray meets.
     fn extend(
         &mut self,
         area: Area,
-        pixels: &mut [Pixel],
         chosen: &[u32],
+        numbers: Range<u32>,
         count: u32,
         mut hits: Option<&mut Vec<Hit>>,
+        mut add: impl FnMut(usize, DVec3),
     ) -> ControlFlow<()> {
         let seed = self.quality.seed;
-        let had = chosen.first().map_or(0, |&pixel| pixels[pixel as usize].count());
-        let each = u64::from(count - had);
-        let wanted = chosen.len() as u64 * each;
-        let pixel_of = |index: u64| chosen[(index / each) as usize];
         let width = 1.0 / f64::from(count).sqrt();
-        for first in (0..wanted).step_by(BATCH) {
-            let run = first..wanted.min(first + BATCH as u64);
-            let samples = run.clone().map(|index| {
-                let pixel = pixel_of(index);
-                let (x, y) = area.pixel_at(pixel);
-                let number = had + (index % each) as u32;
-                let sample = Samples::new(count, seed, x, y).sample(number);
-                CameraSample { x, y, sample, width }
-            });
-            self.wavefront.start(self.view, self.quality, area.frame(), samples);
-            self.tally.samples += run.end - run.start;
-            self.tally.rays +=
-                self.wavefront.run(self.view, self.quality, self.isa, self.on_progress)?;
-            for (index, &color) in run.zip(self.wavefront.colors()) {
-                pixels[pixel_of(index) as usize].add(color);
-            }
-            if let Some(hits) = &mut hits {
-                hits.extend_from_slice(self.wavefront.first_hits());
-            }
-            for &weight in self.wavefront.untraced() {
-                self.tally.untraced += weight;
-                self.tally.most_untraced = self.tally.most_untraced.max(weight);
+        let most_pixels = (BATCH / numbers.len()).max(1);
+        for (batch, pixels) in chosen.chunks(most_pixels).enumerate() {
+            for first in numbers.clone().step_by(BATCH) {
+                let part = first..numbers.end.min(first + BATCH as u32);
+                let samples = pixels.iter().flat_map(|&pixel| {
+                    let (x, y) = area.pixel_at(pixel);
+                    let samples = Samples::new(count, seed, x, y);
+                    part.clone().map(move |number| {
+                        let sample = samples.sample(number);
+                        CameraSample { x, y, sample, width }
+                    })
+                });
+                self.wavefront.start(self.view, self.quality, area.frame(), samples);
+                self.tally.samples += (pixels.len() * part.len()) as u64;
+                self.tally.rays +=
+                    self.wavefront.run(self.view, self.quality, self.isa, self.on_progress)?;
+                let of_pixels = self.wavefront.colors().chunks_exact(part.len());
+                for (place, colors) in (batch * most_pixels..).zip(of_pixels) {
+                    for &color in colors {
+                        add(place, color);
+                    }
+                }
+                if let Some(hits) = &mut hits {
+                    hits.extend_from_slice(self.wavefront.first_hits());
+                }
+                for &weight in self.wavefront.untraced() {
+                    self.tally.untraced += weight;
+                    self.tally.most_untraced = self.tally.most_untraced.max(weight);
+                }
             }
         }
         ControlFlow::Continue(())
     }
 }
 
-/// Faces in pixels that no sample has met, watched until one does.
-#[derive(Default)]
-struct UnseenWatch<'a> {
-    search: Option<UnseenSearch<'a>>,
-    /// Pixels of the area, how many of their samples are noted, and the faces that none of those
-    /// has met or passed.
-    found: Vec<(u32, u32, UnseenFaces)>,
+/// A pixel that may get more samples.
+struct OpenPixel {
+    /// Its place in the area.
+    index: u32,
+    pixel: Pixel,
+    /// The faces in its beam that none of its samples has met or passed.
+    unseen: Option<UnseenFaces>,
 }
 
-impl UnseenWatch<'_> {
-    /// Notes where the latest samples of the pixels of `area` lie.
-    fn note_samples(&mut self, area: Area, pixels: &mut [Pixel], seed: u64) {
-        let Some(search) = &self.search else { return };
-        for (index, noted, unseen) in &mut self.found {
-            let pixel = &mut pixels[*index as usize];
-            let (x, y) = area.pixel_at(*index);
-            let samples = Samples::new(pixel.count(), seed, x, y);
-            if *noted == pixel.count() || unseen.is_empty() {
-                continue;
-            }
-            let places = (*noted..pixel.count()).map(|number| samples.sample(number).place(x, y));
-            search.note_samples(unseen, places, pixel.count());
-            *noted = pixel.count();
-            pixel.set_unseen(unseen.variance(*noted));
+impl OpenPixel {
+    /// Notes where its samples lie from that of number `first` on.
+    fn note_samples(
+        &mut self,
+        search: Option<&UnseenSearch<'_>>,
+        area: Area,
+        seed: u64,
+        first: u32,
+    ) {
+        let (Some(search), Some(unseen)) = (search, &mut self.unseen) else { return };
+        let (count, (x, y)) = (self.pixel.count(), area.pixel_at(self.index));
+        if first < count {
+            let samples = Samples::new(count, seed, x, y);
+            let places = (first..count).map(|number| samples.sample(number).place(x, y));
+            search.note_samples(unseen, places, count);
         }
+        self.pixel.set_unseen(unseen.variance(count));
     }
 }
 
-/// A pixel and its neighbours, by their numbers in the area.
-fn neighbourhood(area: Area, pixel: u32) -> impl Iterator<Item = u32> {
-    let (x, y) = (pixel % area.width(), pixel / area.width());
-    let rows = y.saturating_sub(1)..=area.height().min(y + 2) - 1;
-    rows.flat_map(move |row| {
-        let columns = x.saturating_sub(1)..=area.width().min(x + 2) - 1;
-        columns.map(move |column| row * area.width() + column)
-    })
+/// The pixel (x, y) of the frame and its neighbours, by their places in an area that has them.
+fn neighbours(area: Area, x: u32, y: u32) -> impl Iterator<Item = u32> {
+    let [columns, rows] = [(x, area.columns()), (y, area.rows())]
+        .map(|(middle, all)| all.start.max(middle.saturating_sub(1))..all.end.min(middle + 2));
+    rows.flat_map(move |y| columns.clone().map(move |x| area.index_of(x, y)))
 }

@@ -216,10 +216,9 @@ impl Wavefront {
         let screen = [camera.top_left, camera.right, camera.down].map(DVec3::from_array);
         self.queue.clear();
         self.samples.clear();
-        let (all_samples, differentials) = (&mut self.samples, &mut self.queue.differentials);
-        self.queue.rays.extend(samples.map(|CameraSample { x, y, sample, width }| {
+        samples.for_each(|CameraSample { x, y, sample, width }| {
             if needs_numbers {
-                all_samples.push(sample);
+                self.samples.push(sample);
             }
             let [across, down] = sample.position();
             let u = (f64::from(x) + across) / f64::from(frame.width());
@@ -228,16 +227,16 @@ impl Wavefront {
             if has_textures {
                 let steps = [(1, frame.width()), (2, frame.height())]
                     .map(|(side, count)| screen[side] * (width / f64::from(count)));
-                differentials.push(RayDifferential::of_camera(direction, steps));
+                self.queue.differentials.push(RayDifferential::of_camera(direction, steps));
             }
-            Ray {
+            self.queue.rays.push(Ray {
                 origin: DVec3::from_array(camera.eye),
                 direction: direction / direction.length(),
                 reach: f64::INFINITY,
                 leaving: Surface::NONE,
                 after: Ray::NOTHING_AHEAD,
-            }
-        }));
+            });
+        });
         let count = self.queue.rays.len();
         let branch = |sample| Branch { sample, weight: 1.0, node: 0, depth: 0 };
         self.queue.branches.extend((0..count).map(branch));
