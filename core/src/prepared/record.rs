@@ -369,6 +369,13 @@ impl PlaneIndex {
         if self.0 >> 31 == 1 { -1.0 } else { 1.0 }
     }
 
+    /// What was measured along the plane's normal, as the face looks: its sign flips where that is
+    /// against the normal.
+    #[inline(always)]
+    pub(crate) fn outward(self, distance: f64) -> f64 {
+        f64::from_bits(distance.to_bits() ^ u64::from(self.0 >> 31) << 63)
+    }
+
     /// All faces of a plane are one surface.
     #[inline(always)]
     pub(crate) fn surface(self) -> Surface {

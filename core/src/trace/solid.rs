@@ -117,10 +117,15 @@ impl<'a> Course<'a> {
 
     /// An end of the stretch inside a leaf; rounding moves it no farther than its doubt.
     #[inline(always)]
-    fn end(&self, leaf: &LeafRecord, ulp: f64, (t, cosine): (f64, f64), pin: Pin) -> End {
+    fn end(
+        &self,
+        (leaf, ulp): (&LeafRecord, f64),
+        (t, cosine): (f64, f64),
+        (part, pin): (Part, Pin),
+        enters: bool,
+    ) -> End {
         let doubt = if pin == Pin::No { self.doubt(leaf, ulp, t, cosine) } else { 0.0 };
-        let (low, high) = (t - doubt, t + doubt);
-        End { t, low, high, part: Part::WHOLE, operand: 0, enters: true, pin }
+        End { t, low: t - doubt, high: t + doubt, part, operand: 0, enters, pin }
     }
 
     /// The stretch of the ray's line that is inside a leaf; `None` if there is none, or none that
@@ -128,18 +133,17 @@ impl<'a> Course<'a> {
     #[inline(always)]
     fn meet_leaf(&self, number: u32) -> Option<[End; 2]> {
         let leaf = &self.leaves[number as usize];
-        let ([enter, leave], faces) =
-            if leaf.is_sphere() { (self.meet_sphere(leaf)?, [0, 0]) } else { self.meet_box(leaf)? };
-        let [enter_part, leave_part] = faces.map(|face| Part::new(number, face));
-        (enter.high < leave.low).then_some([
-            End { part: enter_part, ..enter },
-            End { part: leave_part, enters: false, ..leave },
-        ])
+        let ends = if leaf.is_sphere() {
+            self.meet_sphere(number, leaf)?
+        } else {
+            self.meet_box(number, leaf)?
+        };
+        (ends[0].high < ends[1].low).then_some(ends)
     }
 
     /// Where the line enters and leaves a sphere.
     #[inline(always)]
-    fn meet_sphere(&self, leaf: &LeafRecord) -> Option<[End; 2]> {
+    fn meet_sphere(&self, number: u32, leaf: &LeafRecord) -> Option<[End; 2]> {
         let center = DVec3::from_array(leaf.center);
         let surface = Surface(leaf.surface);
         let is_left = self.ray.leaving == surface;
@@ -159,12 +163,16 @@ impl<'a> Course<'a> {
             (hit_sphere(&self.near, center, leaf.radius)?, [Pin::No; 2])
         };
         let cosine = (ends[1] - ends[0]) / (2.0 * leaf.radius);
-        Some([0, 1].map(|k| self.end(leaf, SPHERE_ULP, (ends[k], cosine), pins[k])))
+        let (by, part) = ((leaf, SPHERE_ULP), Part::new(number, 0));
+        Some([
+            self.end(by, (ends[0], cosine), (part, pins[0]), true),
+            self.end(by, (ends[1], cosine), (part, pins[1]), false),
+        ])
     }
 
     /// Where the line enters and leaves a parallelepiped, and through which faces.
     #[inline(always)]
-    fn meet_box(&self, leaf: &LeafRecord) -> Option<([End; 2], [u32; 2])> {
+    fn meet_box(&self, number: u32, leaf: &LeafRecord) -> Option<[End; 2]> {
         // The place, the cosine, the face.
         let mut enter = (f64::NEG_INFINITY, 1.0, 0, Pin::No);
         let mut leave = (f64::INFINITY, 1.0, 0, Pin::No);
@@ -172,7 +180,7 @@ impl<'a> Course<'a> {
             let PlaneRecord { point, normal } = &self.view.planes[plane.index()];
             let [point, normal] = [*point, *normal].map(DVec3::from_array);
             let (distance, along) = toward_plane(&self.near, point, normal);
-            let (distance, along) = (distance * plane.sign(), along * plane.sign());
+            let (distance, along) = (plane.outward(distance), plane.outward(along));
             if along == 0.0 {
                 if distance < 0.0 {
                     return None; // Outside, and never nearer.
@@ -193,8 +201,13 @@ impl<'a> Course<'a> {
                 leave = (t, along, face, pin);
             }
         }
-        let end = |(t, cosine, _, pin)| self.end(leaf, PLANE_ULP, (t, cosine), pin);
-        (enter.0 < leave.0).then(|| ([end(enter), end(leave)], [enter.2, leave.2]))
+        if enter.0 >= leave.0 {
+            return None;
+        }
+        let end = |(t, cosine, face, pin), enters| {
+            self.end((leaf, PLANE_ULP), (t, cosine), (Part::new(number, face), pin), enters)
+        };
+        Some([end(enter, true), end(leave, false)])
     }
 
     /// The nearest common ancestor of two nodes, of which `a` comes first and is no ancestor of
@@ -370,7 +383,7 @@ impl Scratch {
             let ends = if is_lost { None } else { course.meet_leaf(number) };
             if let Some(ends) = ends {
                 self.parts.push(Stretches { node, join, first: self.ends.len() });
-                self.ends.extend(ends);
+                self.ends.extend_from_slice(&ends);
                 next_join = next;
             } else {
                 rest = record.rest;
@@ -392,6 +405,11 @@ impl Scratch {
         let first = self.parts.iter().rposition(|part| part.join != node).expect("a first operand");
         let Stretches { join, first: first_end, .. } = self.parts[first];
         let record = &course.nodes[node as usize];
+        if let Some(count) = self.join_two(course, record, first) {
+            self.parts.truncate(first);
+            self.keep(Stretches { node, join, first: first_end }, count, record, rest);
+            return;
+        }
         let (mut operands, mut end_count) = (0, first_end);
         let mut has_first = false;
         for at in first..self.parts.len() {
@@ -420,12 +438,101 @@ impl Scratch {
             _ => has_first,
         };
         let count = if is_left { self.join_ends(record, first_end) } else { 0 };
-        self.ends.truncate(first_end + count);
+        self.keep(Stretches { node, join, first: first_end }, count, record, rest);
+    }
+
+    /// Keeps so many ends as the stretches of an operation, the last part; if there are none, leaves
+    /// before `rest` make no difference any more.
+    #[inline(always)]
+    fn keep(&mut self, part: Stretches, count: usize, record: &SolidNodeRecord, rest: &mut u32) {
+        self.ends.truncate(part.first + count);
         if count > 0 {
-            self.parts.push(Stretches { node, join, first: first_end });
+            self.parts.push(part);
         } else {
             *rest = (*rest).max(record.rest);
         }
+    }
+
+    /// The same as [`Self::join_ends`] in closed form, for an operation on two operands, the parts
+    /// from `first` on, that have one stretch each. `None` if it is not that, or if rounding cannot
+    /// tell ends apart.
+    #[inline(always)]
+    fn join_two(
+        &mut self,
+        course: &Course<'_>,
+        operation: &SolidNodeRecord,
+        first: usize,
+    ) -> Option<usize> {
+        let [a, b] = self.parts[first..] else { return None };
+        let ends: &mut [End; 4] = (&mut self.ends[a.first..]).try_into().ok()?;
+        let lives = |part: Stretches| course.nodes[part.node as usize].dies_at >= b.join;
+        if b.first != a.first + 2 || !lives(a) || !lives(b) {
+            return None;
+        }
+        let before = |j: usize, k: usize| ends[j].high < ends[k].low;
+        let (a_begins, a_goes_on) = (before(0, 2), before(3, 1));
+        let (a_is_past, b_is_past) = (before(1, 2), before(3, 0));
+        let are_apart = (a_begins || before(2, 0))
+            && (a_goes_on || before(1, 3))
+            && (a_is_past || before(2, 1))
+            && (b_is_past || before(0, 3));
+        if !are_apart {
+            return None;
+        }
+        let doubted: f64 = ends.iter().map(|end| end.high - end.low).sum();
+        let meet = !(a_is_past || b_is_past);
+        let count = match operation.kind {
+            SolidNodeKind::UNION => {
+                if b_is_past {
+                    ends.rotate_left(2);
+                } else if meet {
+                    if !a_begins {
+                        ends[0] = ends[2];
+                    }
+                    if !a_goes_on {
+                        ends[1] = ends[3];
+                    }
+                }
+                if meet { 2 } else { 4 }
+            }
+            SolidNodeKind::INTERSECTION => {
+                if operation.operands > 2 {
+                    return None;
+                }
+                if a_begins {
+                    ends[0] = ends[2];
+                }
+                if a_goes_on {
+                    ends[1] = ends[3];
+                }
+                if meet { 2 } else { 0 }
+            }
+            _ => {
+                if a.node > operation.first_child {
+                    return None;
+                }
+                ends[2].enters = false;
+                ends[3].enters = true;
+                match (meet, a_begins, a_goes_on) {
+                    (false, ..) => 2,
+                    (true, true, true) => {
+                        ends[1..].rotate_left(1);
+                        4
+                    }
+                    (true, true, false) => {
+                        ends[1] = ends[2];
+                        2
+                    }
+                    (true, false, true) => {
+                        ends[0] = ends[3];
+                        2
+                    }
+                    (true, false, false) => 0,
+                }
+            }
+        };
+        self.doubted += doubted;
+        Some(count)
     }
 
     /// Puts the ends of an operation's stretches in the place of its operands' ends, which are the
