@@ -36,6 +36,8 @@ mod steady;
 mod store;
 mod tiles;
 mod waiting;
+#[cfg(test)]
+mod whole_farm;
 
 pub use accept::listen;
 pub use job::Job;

@@ -57,12 +57,7 @@ pub(crate) fn router(shell: &Arc<Shell>) -> Router {
     const WINDOW_BYTES: u32 = 1 << 22;
     // A frame of a delivery; each costs both sides a call of the system.
     const FRAME_BYTES: u32 = 1 << 17;
-    let farm = farm_server::FarmServer::new(FarmService { shell: Arc::clone(shell) })
-        .max_decoding_message_size(MESSAGE_BYTES)
-        .max_encoding_message_size(MESSAGE_BYTES);
-    let jobs = jobs_server::JobsServer::new(JobsService { shell: Arc::clone(shell) })
-        .max_decoding_message_size(MESSAGE_BYTES)
-        .max_encoding_message_size(MESSAGE_BYTES);
+    let (farm, jobs) = services(shell);
     Server::builder()
         .initial_stream_window_size(WINDOW_BYTES)
         .initial_connection_window_size(WINDOW_BYTES)
@@ -73,7 +68,20 @@ pub(crate) fn router(shell: &Arc<Shell>) -> Router {
         .add_service(jobs)
 }
 
-struct FarmService {
+/// What workers call, and what clients call.
+pub(crate) fn services(
+    shell: &Arc<Shell>,
+) -> (farm_server::FarmServer<FarmService>, jobs_server::JobsServer<JobsService>) {
+    let farm = farm_server::FarmServer::new(FarmService { shell: Arc::clone(shell) })
+        .max_decoding_message_size(MESSAGE_BYTES)
+        .max_encoding_message_size(MESSAGE_BYTES);
+    let jobs = jobs_server::JobsServer::new(JobsService { shell: Arc::clone(shell) })
+        .max_decoding_message_size(MESSAGE_BYTES)
+        .max_encoding_message_size(MESSAGE_BYTES);
+    (farm, jobs)
+}
+
+pub(crate) struct FarmService {
     shell: Arc<Shell>,
 }
 
@@ -233,7 +241,7 @@ fn to_verdict(verdict: Verdict) -> wire::Verdict {
     }
 }
 
-struct JobsService {
+pub(crate) struct JobsService {
     shell: Arc<Shell>,
 }
 
@@ -306,6 +314,7 @@ impl jobs_server::Jobs for JobsService {
                 }
                 tokio::time::sleep(WATCH_PERIOD).await;
                 tokio::select! {
+                    biased;
                     changed = progress.changed() => if changed.is_err() { return },
                     () = send.closed() => return,
                 }
@@ -553,6 +562,10 @@ fn broken(error: &io::Error) -> Status {
 async fn blocking<T: Send + 'static>(
     work: impl FnOnce() -> Result<T, Status> + Send + 'static,
 ) -> Result<T, Status> {
+    if cfg!(test) {
+        // A simulation has one thread.
+        return work();
+    }
     match tokio::task::spawn_blocking(work).await {
         Ok(result) => result,
         Err(error) => Err(Status::internal(error.to_string())),

@@ -368,6 +368,7 @@ impl Shell {
                 }
             };
             tokio::select! {
+                biased;
                 () = sleep => self.tell_farm(Farm::on_time),
                 () = self.earlier.notified() => {}
             }
@@ -584,6 +585,14 @@ fn progress_of(plan: &Plan, done: &[(TileId, TileRecord)]) -> (Tiles, Earlier) {
         earlier.worker_count = earlier.worker_count.max(record.worker_count);
     }
     (tiles, earlier)
+}
+
+#[cfg(test)]
+impl Shell {
+    /// Checks every invariant of the machine, at the price of a scan.
+    pub(crate) fn check(&self) {
+        self.state().farm.check();
+    }
 }
 
 impl State {

@@ -2,7 +2,7 @@
 //! what real ones did. What it makes of slow workers, of a liar and of a deadly tile.
 
 use std::{
-    collections::{BTreeMap, VecDeque},
+    collections::{BTreeMap, BTreeSet, VecDeque},
     time::{Duration, Instant},
 };
 
@@ -318,4 +318,148 @@ fn is_caught(seed: u64, to_the_end: bool) -> bool {
 fn a_worker_that_falsifies_five_percent_is_caught_and_leaves_no_trace_in_the_picture() {
     let caught = (0..40).filter(|&seed| is_caught(seed, seed < 2)).count();
     assert!(caught >= 39, "{caught} of 40");
+}
+
+/// How long one coordinator takes for a tile: it carries 22,600 a second (docs/reliability.md).
+const SERIAL: Duration = Duration::from_micros(44);
+
+/// How long a message is on its way.
+const LATENCY: Duration = Duration::from_micros(500);
+
+/// What happens to a worker of a large farm.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+enum Event {
+    /// Its question is heard.
+    Asks,
+    /// Its answer is there.
+    Gets,
+    /// Its thread has rendered the first of its tiles.
+    Renders,
+    /// The tile is heard.
+    Brings(TileId, LeaseName),
+}
+
+/// The time that a picture takes on so many workers of one thread: each measured tile stands for
+/// `side` x `side` that cost as much as it does. What the coordinator does it does one after the other.
+fn time_on(workers: usize, side: usize) -> (Duration, Duration) {
+    let (columns, rows) = (20 * side, 15 * side);
+    let cost = |tile: TileId| {
+        let (x, y) = (tile.index() % columns / side, tile.index() / columns / side);
+        Duration::from_millis(COSTS[y * 20 + x])
+    };
+    #[expect(clippy::disallowed_methods, reason = "any instant will do")]
+    let start = Instant::now();
+    let term = Duration::from_secs(60);
+    let audit = Audit::new(0.0, [0; 32]);
+    let mut farm = Farm::new(Identity::from_random([1; 24]), term, audit);
+    let size = Size::new(columns as u64 * 16, rows as u64 * 16).unwrap();
+    let grid = TileGrid::new(size, 16).unwrap();
+    let job = farm.number_job();
+    farm.on_submit(job, Tiles::new(grid), start);
+    let work = (0..grid.count()).map(|number| cost(grid.tile(number).unwrap())).sum();
+
+    let mut events = BTreeSet::new();
+    let mut ids = Vec::new();
+    let mut queues = vec![VecDeque::<(LeaseName, TileId)>::new(); workers];
+    let (mut is_busy, mut asks) = (vec![false; workers], vec![true; workers]);
+    for index in 0..workers {
+        let process = Process { nonce: index as u64, threads: 1, ..Process::default() };
+        ids.push(farm.on_join(process, start).0.unwrap());
+        events.insert((start + LATENCY, index, Event::Asks));
+    }
+    // Until when the coordinator has to do.
+    let mut free_at = start;
+    let mut number = 0;
+    loop {
+        let wake =
+            farm.next_wake().filter(|&wake| events.first().is_none_or(|first| wake < first.0));
+        let (now, actions) = if let Some(wake) = wake {
+            (wake, farm.on_time(wake))
+        } else {
+            let (now, index, event) = events.pop_first().expect("something happens");
+            let actions = match event {
+                Event::Asks => {
+                    let ask =
+                        Ask { worker: ids[index], most: 32, until: now + Duration::from_secs(10) };
+                    farm.on_ask(AskId((index + 1) as u64), ask, now)
+                }
+                Event::Brings(tile, lease) => {
+                    number += 1;
+                    free_at = free_at.max(now) + SERIAL;
+                    let (hash, tally) = ([0; 32], Tally::default());
+                    let seconds = cost(tile).as_secs_f64();
+                    let worker = ids[index];
+                    let delivery = Delivery { worker, lease, tile, hash, seconds, tally };
+                    let mut actions = farm.on_pixels(DeliveryId(number), delivery, now);
+                    if actions.iter().any(|action| matches!(action, Action::Store(..))) {
+                        actions.extend(farm.on_stored(job, tile, now));
+                    }
+                    actions
+                }
+                Event::Renders => {
+                    let (lease, tile) = queues[index].pop_front().expect("it rendered one");
+                    events.insert((free_at.max(now) + LATENCY, index, Event::Brings(tile, lease)));
+                    is_busy[index] = false;
+                    Vec::new()
+                }
+                Event::Gets => Vec::new(),
+            };
+            if !is_busy[index]
+                && let Some(&(_, tile)) = queues[index].front()
+            {
+                is_busy[index] = true;
+                events.insert((now + cost(tile), index, Event::Renders));
+            }
+            if queues[index].len() < 2 && !asks[index] {
+                asks[index] = true;
+                events.insert((free_at.max(now) + LATENCY, index, Event::Asks));
+            }
+            (now, actions)
+        };
+        for action in actions {
+            match action {
+                Action::Answer(AskId(id), answer) => {
+                    let index = id as usize - 1;
+                    asks[index] = false;
+                    if let Ok(Next::Render(run)) = answer {
+                        let tiles = run.tiles.into_iter();
+                        queues[index].extend(tiles.map(|tile| (run.lease, tile)));
+                    }
+                    events.insert((free_at.max(now) + LATENCY, index, Event::Gets));
+                }
+                Action::Publish(_, progress) if progress.outcome.is_some() => {
+                    return (work, free_at.max(now) - start);
+                }
+                _ => {}
+            }
+        }
+    }
+}
+
+/// `cargo test --release -p rtfarm-coordinator scale -- --ignored --nocapture` prints the table of
+/// docs/reliability.md.
+#[test]
+#[ignore = "it takes a while"]
+fn scale_to_ten_thousand_workers() {
+    for (side, workers) in [1, 10, 100, 1000, 3000, 10_000]
+        .map(|workers| (24, workers))
+        .into_iter()
+        .chain([(72, 10_000)])
+    {
+        let (work, time) = time_on(workers, side);
+        let (work, time) = (work.as_secs_f64(), time.as_secs_f64());
+        let efficiency = work / time / workers as f64;
+        let tiles = 300 * side * side;
+        // What the longest tile and the coordinator's turn at each tile allow.
+        let longest = COSTS.into_iter().max().unwrap() as f64 / 1e3;
+        let serial = SERIAL.as_secs_f64() * tiles as f64;
+        let model = work / (work / workers as f64 + longest / 2.0).max(serial) / workers as f64;
+        eprintln!(
+            "| {tiles} | {workers} | {time:.2} | {:.1} | {:.1} % | {:.1} % |",
+            work / time,
+            efficiency * 100.0,
+            model * 100.0
+        );
+        assert!(workers > 1000 || efficiency >= 0.95, "{workers} workers: {efficiency}");
+    }
 }

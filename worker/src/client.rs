@@ -1,32 +1,26 @@
 //! Calls over gRPC: a question goes out as a wire message, its answer comes back parsed. What a
 //! `Status` says of the coordinator is read here and nowhere else.
 
-use std::{error::Error, sync::Arc, time::Duration};
+use std::{sync::Arc, time::Duration};
 
 use rtfarm_proto::{
-    Address, FarmId, Incarnation, LeaseName, MESSAGE_BYTES, PROTOCOL, WireError, WorkerId,
+    FarmId, Incarnation, LeaseName, MESSAGE_BYTES, PROTOCOL, WireError, WorkerId,
     wire::{self, farm_client::FarmClient, lease_response},
 };
-use tonic::{Code, Status, transport::Channel};
+use tonic::{Code, Status};
 
 use crate::{
     call::{Answer, Call, CallError, CallErrorKind, Delivery, KeptTiles, Membership, Next, Run},
     config::Config,
     job::{Job, JobError},
+    outside::Connection,
 };
 
-/// Reaches a coordinator.
-pub(crate) async fn connect(address: &Address) -> Result<FarmClient<Channel>, CallError> {
-    let channel = address.connect().await.map_err(|error| {
-        let mut reason: &dyn Error = &error;
-        while let Some(source) = reason.source() {
-            reason = source;
-        }
-        CallError { kind: CallErrorKind::NoAnswer, message: reason.to_string() }
-    })?;
-    Ok(FarmClient::new(channel)
+/// Speaks over a connection.
+pub(crate) fn over<C: Connection>(connection: C) -> FarmClient<C> {
+    FarmClient::new(connection)
         .max_decoding_message_size(MESSAGE_BYTES)
-        .max_encoding_message_size(MESSAGE_BYTES))
+        .max_encoding_message_size(MESSAGE_BYTES)
 }
 
 /// What this process says of itself when it joins. `nonce` tells its repeated question from
@@ -46,8 +40,8 @@ pub(crate) fn introduction(config: &Config, nonce: u64) -> wire::JoinRequest {
 }
 
 /// Makes a call on a connection, once.
-pub(crate) async fn ask(
-    mut client: FarmClient<Channel>,
+pub(crate) async fn ask<C: Connection>(
+    mut client: FarmClient<C>,
     introduction: Arc<wire::JoinRequest>,
     call: Call,
 ) -> Result<Answer, CallError> {

@@ -11,6 +11,7 @@ mod error;
 mod job;
 mod map;
 mod outbox;
+mod outside;
 mod parent;
 mod pulse;
 mod reference;
@@ -25,3 +26,12 @@ pub use parent::{ParentError, die_with_parent};
 pub use reference::reference;
 pub use run::run;
 pub use scene::SceneError;
+
+/// A door for simulations.
+#[doc(hidden)]
+pub mod simulation {
+    pub use crate::{
+        outside::{Connection, Outside},
+        run::run_in,
+    };
+}

@@ -56,6 +56,7 @@ impl Outbox {
     pub(crate) async fn due(&self) {
         let turn_ends = self.state().turn_ends;
         tokio::select! {
+            biased;
             () = self.due.notified() => {}
             () = sleep_until(turn_ends), if Instant::now() < turn_ends => {}
         }

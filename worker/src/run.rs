@@ -13,7 +13,19 @@ use std::{
     time::Duration,
 };
 
-use rayon::{ThreadPool, ThreadPoolBuilder};
+use crate::{
+    call::{Answer, Call, CallError, CallErrorKind, Delivery},
+    client,
+    config::Config,
+    error::WorkerError,
+    job::Job,
+    outbox::Outbox,
+    outside::{Machine, Outside},
+    pulse::Pulse,
+    scene::{self, Scene, SceneError},
+    task::{Action, TaskId},
+    worker::Worker,
+};
 use rtfarm_core::{prepared::SceneHash, render::render_tile, tile::TileId};
 use rtfarm_proto::{
     Address, LeaseName, pixels_to_bytes,
@@ -24,20 +36,6 @@ use tokio::{
     task::{AbortHandle, JoinError, JoinSet},
     time::Instant,
 };
-use tonic::transport::Channel;
-
-use crate::{
-    call::{Answer, Call, CallError, Delivery},
-    client,
-    config::Config,
-    error::WorkerError,
-    job::Job,
-    outbox::Outbox,
-    pulse::Pulse,
-    scene::{Scene, SceneError, load},
-    task::{Action, TaskId},
-    worker::Worker,
-};
 
 /// Works for the coordinator until that sends it home or `shutdown` comes, which says how long the
 /// tiles in hand may still take.
@@ -45,9 +43,19 @@ pub async fn run(
     config: Config,
     shutdown: impl Future<Output = Duration>,
 ) -> Result<(), WorkerError> {
-    let nonce = random()?;
+    let machine = Machine::new(config.threads)?;
+    run_in(machine, config, random()?, shutdown).await
+}
+
+/// The same in any surroundings. `nonce` should differ between workers.
+pub async fn run_in(
+    outside: impl Outside,
+    config: Config,
+    nonce: u64,
+    shutdown: impl Future<Output = Duration>,
+) -> Result<(), WorkerError> {
     let mut worker = Worker::new(&config, nonce, now());
-    let mut shell = Shell::new(config, nonce)?;
+    let mut shell = Shell::new(outside, config, nonce);
     let mut shutdown = pin!(shutdown);
     let mut is_stopped = false;
     loop {
@@ -57,6 +65,14 @@ pub async fn run(
             }
         }
         tokio::select! {
+            // Always in the same order, so that a simulation can be repeated; the rarest first.
+            biased;
+            grace = &mut shutdown, if !is_stopped => {
+                is_stopped = true;
+                worker.on_stop(grace, now());
+            }
+            () = sleep_until(worker.wake_at()) => worker.on_tick(now()),
+            Some(()) = shell.beats.recv() => worker.on_beat(&shell.pulse.count(), now()),
             Some(report) = shell.reports.join_next() => shell.pass_on(report, &mut worker),
             () = shell.outbox.due() => {
                 let rendered = shell.outbox.take();
@@ -64,12 +80,6 @@ pub async fn run(
                     shell.renderings.remove(task);
                 }
                 worker.on_tiles_rendered(rendered, now());
-            }
-            Some(()) = shell.beats.recv() => worker.on_beat(&shell.pulse.count(), now()),
-            () = sleep_until(worker.wake_at()) => worker.on_tick(now()),
-            grace = &mut shutdown, if !is_stopped => {
-                is_stopped = true;
-                worker.on_stop(grace, now());
             }
         }
     }
@@ -94,16 +104,16 @@ async fn sleep_until(moment: Option<std::time::Instant>) {
 }
 
 /// The tasks that run, and what they need.
-struct Shell {
+struct Shell<O: Outside> {
+    outside: Arc<O>,
     config: Config,
     introduction: Arc<wire::JoinRequest>,
-    client: Option<FarmClient<Channel>>,
+    client: Option<FarmClient<O::Connection>>,
     scenes: HashMap<SceneHash, Arc<Scene>>,
     /// Calls and fetches.
-    reports: JoinSet<(TaskId, Report)>,
+    reports: JoinSet<(TaskId, Report<O::Connection>)>,
     /// How each of them is stopped.
     running: HashMap<TaskId, AbortHandle>,
-    pool: ThreadPool,
     renderings: HashMap<TaskId, Rendering>,
     outbox: Arc<Outbox>,
     pulse: Arc<Pulse>,
@@ -111,12 +121,18 @@ struct Shell {
 }
 
 /// What came of a call or a fetch.
-enum Report {
-    Connected(FarmClient<Channel>),
+enum Report<C> {
+    Connected(FarmClient<C>),
     Answered(Answer),
     Failed(CallError),
     Fetched(SceneHash, Arc<Scene>),
     FetchFailed(SceneError),
+}
+
+impl<C> Report<C> {
+    fn unreached(reason: String) -> Self {
+        Self::Failed(CallError { kind: CallErrorKind::NoAnswer, message: reason })
+    }
 }
 
 /// A tile in the hands of the threads. Dropping this stops it.
@@ -130,15 +146,12 @@ impl Drop for Rendering {
     }
 }
 
-impl Shell {
-    fn new(config: Config, nonce: u64) -> Result<Self, WorkerError> {
-        let pool = ThreadPoolBuilder::new()
-            .num_threads(config.threads)
-            .thread_name(|index| format!("render-{index}"))
-            .build()?;
+impl<O: Outside> Shell<O> {
+    fn new(outside: O, config: Config, nonce: u64) -> Self {
         // Nothing beats before the worker has joined and chosen the period.
         let (pulse, beats) = Pulse::new(Duration::ZERO);
-        Ok(Self {
+        Self {
+            outside: Arc::new(outside),
             introduction: Arc::new(client::introduction(&config, nonce)),
             outbox: Arc::new(Outbox::new(config.threads)),
             config,
@@ -146,11 +159,10 @@ impl Shell {
             scenes: HashMap::new(),
             reports: JoinSet::new(),
             running: HashMap::new(),
-            pool,
             renderings: HashMap::new(),
             pulse: Arc::new(pulse),
             beats,
-        })
+        }
     }
 
     /// Does what was decided. Breaks when that is to end.
@@ -177,9 +189,10 @@ impl Shell {
 
     fn call(&mut self, task: TaskId, call: Call) {
         let Some(client) = self.client.clone() else {
-            let address = self.config.coordinator.clone();
+            let (outside, address) = (Arc::clone(&self.outside), self.config.coordinator.clone());
             return self.start(task, async move {
-                client::connect(&address).await.map_or_else(Report::Failed, Report::Connected)
+                let connected = outside.connect(&address).await.map(client::over);
+                connected.map_or_else(Report::unreached, Report::Connected)
             });
         };
         let introduction = Arc::clone(&self.introduction);
@@ -191,22 +204,33 @@ impl Shell {
 
     fn fetch(&mut self, task: TaskId, job: Arc<Job>, lease: LeaseName, silence: Duration) {
         let client = self.client.clone().expect("a worker connects before it fetches");
-        let (scene, pulse) = (job.scene, Arc::clone(&self.pulse));
+        let (outside, pulse) = (Arc::clone(&self.outside), Arc::clone(&self.pulse));
         let is_local = matches!(self.config.coordinator, Address::Unix(_));
         self.start(task, async move {
-            match load(job, lease, is_local, silence, client, pulse).await {
-                Ok(loaded) => Report::Fetched(scene, loaded),
-                Err(error) => Report::FetchFailed(error),
-            }
+            let hash = job.scene;
+            let beat = move || pulse.beat((lease, None));
+            let loaded = match scene::bring(&job, is_local, silence, client, &beat).await {
+                Ok(file) => outside.block(move || scene::open(&file, &job, &beat)).await,
+                Err(error) => Err(error),
+            };
+            loaded.map_or_else(Report::FetchFailed, |scene| Report::Fetched(hash, scene))
         });
     }
 
-    fn start(&mut self, task: TaskId, work: impl Future<Output = Report> + Send + 'static) {
+    fn start(
+        &mut self,
+        task: TaskId,
+        work: impl Future<Output = Report<O::Connection>> + Send + 'static,
+    ) {
         let handle = self.reports.spawn(async move { (task, work.await) });
         self.running.insert(task, handle);
     }
 
-    fn pass_on(&mut self, report: Result<(TaskId, Report), JoinError>, worker: &mut Worker) {
+    fn pass_on(
+        &mut self,
+        report: Result<(TaskId, Report<O::Connection>), JoinError>,
+        worker: &mut Worker,
+    ) {
         let (task, report) = match report {
             Ok(report) => report,
             Err(error) if error.is_panic() => resume_unwind(error.into_panic()),
@@ -232,7 +256,7 @@ impl Shell {
         }
     }
 
-    /// Has a tile rendered, as one job of the pool.
+    /// Has a tile rendered, as one piece of work of the threads.
     fn render(&mut self, task: TaskId, lease: LeaseName, tile: TileId, job: Arc<Job>) {
         let is_stopped = Arc::new(AtomicBool::new(false));
         self.renderings.insert(task, Rendering { is_stopped: Arc::clone(&is_stopped) });
@@ -240,8 +264,7 @@ impl Shell {
         let (pulse, outbox) = (Arc::clone(&self.pulse), Arc::clone(&self.outbox));
         outbox.on_begun();
         let isa = self.config.isa;
-        self.pool.spawn_fifo(move || {
-            let started = Instant::now();
+        self.outside.render(move |started| {
             let mut on_progress = || {
                 pulse.beat((lease, Some(tile)));
                 if is_stopped.load(Ordering::Relaxed) {

@@ -10,14 +10,11 @@ use std::{
 };
 
 use rtfarm_core::prepared::{PreparedError, PreparedScene};
-use rtfarm_proto::{
-    LeaseName,
-    wire::{self, farm_client::FarmClient},
-};
+use rtfarm_proto::wire::{self, farm_client::FarmClient};
 use rustix::fs::OFlags;
-use tonic::{Code, Status, transport::Channel};
+use tonic::{Code, Status};
 
-use crate::{job::Job, map::Map, pulse::Pulse};
+use crate::{job::Job, map::Map, outside::Connection};
 
 pub(crate) type Scene = PreparedScene<Map>;
 
@@ -56,24 +53,20 @@ impl From<Status> for SceneError {
     }
 }
 
-/// Brings the scene of a job of which tiles are leased into memory. Every sign of progress beats
-/// `pulse`; no piece of the scene may take the coordinator longer than `silence`. Only a
-/// coordinator that is certainly on this machine, `is_local`, can know where the scene is here.
-pub(crate) async fn load(
-    job: Arc<Job>,
-    lease: LeaseName,
+/// Brings the scene of a job here. Every sign of progress is a `beat`; no piece of the scene may take
+/// the coordinator longer than `silence`. Only a coordinator that is certainly on this machine,
+/// `is_local`, can know where the scene is here.
+pub(crate) async fn bring<C: Connection>(
+    job: &Job,
     is_local: bool,
     silence: Duration,
-    client: FarmClient<Channel>,
-    pulse: Arc<Pulse>,
-) -> Result<Arc<Scene>, SceneError> {
-    let file = match &job.scene_path {
-        Some(path) if is_local => find(path)?,
-        _ => fetch(&job, silence, client, &|| pulse.beat((lease, None))).await?,
-    };
-    let opened =
-        tokio::task::spawn_blocking(move || open(&file, &job, &|| pulse.beat((lease, None)))).await;
-    opened.map_err(io::Error::other)?
+    client: FarmClient<C>,
+    beat: &(dyn Fn() + Sync),
+) -> Result<File, SceneError> {
+    match &job.scene_path {
+        Some(path) if is_local => find(path),
+        _ => fetch(job, silence, client, beat).await,
+    }
 }
 
 /// Opens a scene's file. Nothing else is opened in its place, nor waited for.
@@ -93,10 +86,10 @@ fn find(path: &Path) -> Result<File, SceneError> {
     }
 }
 
-async fn fetch(
+async fn fetch<C: Connection>(
     job: &Job,
     silence: Duration,
-    mut client: FarmClient<Channel>,
+    mut client: FarmClient<C>,
     beat: &(dyn Fn() + Sync),
 ) -> Result<File, SceneError> {
     // The file has no name, so that nothing stays behind.
@@ -122,7 +115,8 @@ async fn fetch(
     Ok(file)
 }
 
-fn open(file: &File, job: &Job, beat: &dyn Fn()) -> Result<Arc<Scene>, SceneError> {
+/// Checks a scene and maps it into memory.
+pub(crate) fn open(file: &File, job: &Job, beat: &dyn Fn()) -> Result<Arc<Scene>, SceneError> {
     let scene = PreparedScene::open_in_steps(Map::new(file)?, &mut || beat())?;
     if scene.hash() != job.scene {
         return Err(SceneError::Hash);
@@ -138,14 +132,14 @@ mod tests {
         render::{Quality, Settings},
         tile::{Size, TileGrid},
     };
-    use rtfarm_proto::{Address, Incarnation, JobId, LeaseId, TileHasher};
+    use rtfarm_proto::{Address, Incarnation, JobId, TileHasher};
     use rustix::fs::{CWD, FileType, Mode, mknodat};
     use tonic::transport::Endpoint;
 
     use super::*;
 
     /// What comes of a job whose scene is said to be at `path`, with a coordinator that is gone.
-    async fn load_from(path: &Path, is_local: bool) -> Result<Arc<Scene>, SceneError> {
+    async fn bring_from(path: &Path, is_local: bool) -> Result<File, SceneError> {
         let size = Size::new(16, 16).unwrap();
         let settings = Settings { size, quality: Quality::default() };
         let grid = TileGrid::new(size, 16).unwrap();
@@ -160,9 +154,7 @@ mod tests {
         };
         let nowhere = Address::Tcp("127.0.0.1:1".to_owned()).to_string();
         let client = FarmClient::new(Endpoint::from_shared(nowhere).unwrap().connect_lazy());
-        let (pulse, _beats) = Pulse::new(Duration::ZERO);
-        let lease = LeaseName { job: JobId(1), id: LeaseId(1) };
-        load(Arc::new(job), lease, is_local, Duration::from_secs(20), client, Arc::new(pulse)).await
+        bring(&job, is_local, Duration::from_secs(20), client, &|| {}).await
     }
 
     #[tokio::test]
@@ -170,14 +162,14 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let pipe = folder.path().join("pipe");
         mknodat(CWD, &pipe, FileType::Fifo, Mode::RUSR | Mode::WUSR, 0).unwrap();
-        let error = load_from(&pipe, true).await.unwrap_err();
+        let error = bring_from(&pipe, true).await.unwrap_err();
         assert!(error.to_string().contains("it is no regular file"), "{error}");
     }
 
     #[tokio::test]
     async fn a_coordinator_elsewhere_cannot_name_a_file_here() {
         let file = tempfile::NamedTempFile::new().unwrap();
-        let error = load_from(file.path(), false).await.unwrap_err();
+        let error = bring_from(file.path(), false).await.unwrap_err();
         assert!(matches!(error, SceneError::Gone(_)), "it is asked for the scene: {error}");
     }
 }
