@@ -35,6 +35,7 @@ mod store;
 mod tiles;
 mod waiting;
 
+pub use farm::Keeping;
 pub use job::Job;
 pub use run::{Coordinator, Listener};
 pub use shell::{Config, SubmitError};
