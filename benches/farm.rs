@@ -1,6 +1,6 @@
-//! What the farm costs: one picture rendered in one process and by two workers, in turn.
+//! What the farm costs: pictures rendered in one process and by two workers, in turn.
 //!
-//! `cargo bench --bench farm [-- SCENE SIZE SAMPLES ROUNDS]`
+//! `cargo bench --bench farm [-- ROUNDS]` prints medians.
 
 use std::{
     env, fs,
@@ -47,60 +47,97 @@ geometry
     [head, &spheres.concat(), "endgeometry\n"].concat()
 }
 
+/// A picture, and how it is asked for.
+struct Picture {
+    what: &'static str,
+    arguments: &'static [&'static str],
+    /// Tiles that it is cut into.
+    tiles: f64,
+}
+
+const PICTURES: [Picture; 3] = [
+    Picture {
+        what: "a short picture",
+        arguments: &["--size", "640x360", "--samples", "16"],
+        tiles: 920.0,
+    },
+    Picture {
+        what: "a long picture",
+        arguments: &["--size", "1280x720", "--samples", "100"],
+        tiles: 920.0,
+    },
+    Picture {
+        what: "tiles of 16",
+        arguments: &["--size", "2048x2048", "--samples", "1", "--flat", "--tile", "16"],
+        tiles: 16_384.0,
+    },
+];
+
 fn main() -> anyhow::Result<()> {
     let words: Vec<String> = env::args().skip(1).filter(|word| word != "--bench").collect();
-    let word = |index: usize, default: &str| {
-        words.get(index).map_or_else(|| default.to_owned(), String::clone)
-    };
+    let rounds = words.first().map_or(Ok(5), |word| word.parse()).context("the rounds")?;
     let folder = tempfile::tempdir()?;
-    let scene = word(0, "bench.rt");
-    if words.is_empty() {
-        fs::write(folder.path().join(&scene), scene_text())?;
-    }
-    let scene = env::current_dir()?.join(folder.path().join(&scene));
-    let (size, samples) = (word(1, "1280x720"), word(2, "64"));
-    let rounds: usize = word(3, "5").parse().context("the number of rounds")?;
-
-    let [mut here, mut farm] = [Vec::new(), Vec::new()];
+    let scene = folder.path().join("bench.rt");
+    fs::write(&scene, scene_text())?;
     let mut out = io::stdout().lock();
-    for round in 1..=rounds {
-        for (workers, threads, times) in [("0", "2", &mut here), ("2", "1", &mut farm)] {
-            let seconds = render(&scene, folder.path(), [&size, &samples, workers, threads])?;
-            writeln!(
-                out,
-                "round {round}: --workers {workers} --threads {threads}: {seconds:.3} s"
-            )?;
-            times.push(seconds);
+    for Picture { what, arguments, tiles } in PICTURES {
+        let [mut here, mut farm] = [Vec::new(), Vec::new()];
+        for _ in 0..rounds {
+            for (workers, threads, costs) in [("0", "2", &mut here), ("2", "1", &mut farm)] {
+                let workers = ["--workers", workers, "--threads", threads];
+                costs.push(render(&scene, folder.path(), arguments, workers)?);
+            }
         }
+        let ([time, processor], [farm_time, farm_processor]) = (median(&here), median(&farm));
+        writeln!(
+            out,
+            "{what}: {time:.3} s in one process, {farm_time:.3} s by two workers; processor time \
+             {processor:.2} s, {farm_processor:.2} s: {:.3} x, {:+.1} us a tile",
+            farm_processor / processor,
+            (farm_processor - processor) * 1e6 / tiles,
+        )?;
     }
-    let (here, farm) = (median(&mut here), median(&mut farm));
-    writeln!(out, "median in one process, 2 threads:    {here:.3} s")?;
-    writeln!(out, "median by 2 workers, 1 thread each:  {farm:.3} s")?;
-    writeln!(out, "ratio:                               {:.3}", farm / here)?;
     Ok(())
 }
 
+/// What a render took: seconds, and seconds of processor time of all its processes.
 fn render(
     scene: &Path,
     folder: &Path,
-    [size, samples, workers, threads]: [&str; 4],
-) -> anyhow::Result<f64> {
-    let started = Instant::now();
+    arguments: &[&str],
+    workers: [&str; 4],
+) -> anyhow::Result<[f64; 2]> {
+    let (started, before) = (Instant::now(), processor_time()?);
     let status = Command::new(env!("CARGO_BIN_EXE_rtfarm"))
         .arg("render")
         .arg(scene)
-        .args(["--size", size, "--samples", samples, "--workers", workers, "--threads", threads])
+        .args(arguments)
+        .args(workers)
         .args(["-o", "bench.png"])
         .current_dir(folder)
-        .env("RUST_LOG", "warn")
         .stdin(Stdio::null())
         .stdout(Stdio::null())
+        .stderr(Stdio::null())
         .status()?;
     ensure!(status.success(), "the render failed");
-    Ok(started.elapsed().as_secs_f64())
+    Ok([started.elapsed().as_secs_f64(), processor_time()? - before])
 }
 
-fn median(times: &mut [f64]) -> f64 {
-    times.sort_by(f64::total_cmp);
-    times[times.len() / 2]
+/// Seconds of processor time of all processes that this one has started and waited for, and of those
+/// that they had. See `proc_pid_stat(5)`; a tick is 10 ms.
+fn processor_time() -> anyhow::Result<f64> {
+    let line = fs::read_to_string("/proc/self/stat")?;
+    let (_, fields) = line.rsplit_once(')').context("a process has a name")?;
+    let fields: Vec<&str> = fields.split_whitespace().collect();
+    let ticks =
+        |index: usize| fields.get(index).context("a field")?.parse::<f64>().context("ticks");
+    Ok((ticks(13)? + ticks(14)?) / 100.0)
+}
+
+fn median(costs: &[[f64; 2]]) -> [f64; 2] {
+    [0, 1].map(|index| {
+        let mut costs: Vec<f64> = costs.iter().map(|cost| cost[index]).collect();
+        costs.sort_by(f64::total_cmp);
+        costs[costs.len() / 2]
+    })
 }

@@ -11,7 +11,7 @@ use rtfarm_core::{
     language::{Severity, Style, draw_diagnostics, read_scene},
     prepare::prepare,
     prepared::{PreparedBytes, PreparedError, PreparedScene},
-    render::{Cutoff, Quality, Sampling, render_tile},
+    render::{Quality, Sampling, render_tile},
     scene::{MeshVertices, Scene, SolidNode},
     tile::{Area, Size},
 };
@@ -114,8 +114,7 @@ pub(crate) fn prepared(data: &[u8]) {
         _ => Sampling::adaptive(0.1, 16),
     };
     let sampling = sampling.expect("both are in range");
-    let cutoff = Cutoff::new(0.01).expect("a weight");
-    let quality = Quality { sampling, cutoff, ..Quality::default() };
+    let quality = Quality { sampling, ..Quality::default() };
     let area = Area::whole(Size::new(4, 4).expect("a size"));
     let picture = |isa| {
         let go_on = &mut || ControlFlow::Continue(());

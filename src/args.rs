@@ -8,7 +8,7 @@ use clap::{
 };
 use rtfarm_core::{
     isa::{Isa, IsaError},
-    render::{Cutoff, Quality, SampleCount, SampleLimit, Sampling, StandardError},
+    render::{Quality, SampleCount, SampleLimit, Sampling, StandardError},
     tile::{Crop, Size, SizeError, TileGrid},
     transfer::Transfer,
 };
@@ -169,11 +169,6 @@ pub(crate) struct PictureArgs {
     /// Show every surface in its plain colour, as in a scene without light.
     #[arg(long)]
     flat: bool,
-
-    /// Mirrored and transmitted light that counts less than this in its sample is taken for
-    /// background.
-    #[arg(long, value_name = "WEIGHT", default_value_t = Cutoff::DEFAULT, value_parser = parse_cutoff)]
-    cutoff: Cutoff,
 
     /// Whether surfaces that mirror light others.
     #[arg(long, value_name = "on|off", default_value = "on", hide_possible_values = true)]
@@ -492,7 +487,6 @@ impl PictureArgs {
                 seed: self.seed,
                 flat: self.flat,
                 secondary: matches!(self.secondary, Switch::On),
-                cutoff: self.cutoff,
             },
             crop: self.crop,
             tile_side: self.tile,
@@ -575,11 +569,6 @@ fn parse_transfer(text: &str) -> Result<Transfer, String> {
         "srgb" => Ok(Transfer::Srgb),
         _ => Err("a transfer is none or srgb".to_owned()),
     }
-}
-
-fn parse_cutoff(text: &str) -> Result<Cutoff, &'static str> {
-    let cutoff = text.parse().ok().and_then(Cutoff::new);
-    cutoff.ok_or("a weight must be a number from 0 to 1")
 }
 
 fn parse_seconds(text: &str) -> Result<Duration, String> {

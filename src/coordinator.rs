@@ -12,10 +12,7 @@ use rtfarm_coordinator::{
     Config, Coordinator, Durability, Keeping, Listener, StateError, StateFolder,
 };
 use rtfarm_core::isa::Isa;
-use tokio::{
-    net::{TcpListener, lookup_host},
-    task::spawn_blocking,
-};
+use tokio::{net::lookup_host, task::spawn_blocking};
 use tokio_util::sync::CancellationToken;
 
 use crate::{
@@ -48,8 +45,8 @@ pub(crate) async fn run(
     let private = args.state.is_none().then(|| PrivateFolder::new(&env::temp_dir())).transpose()?;
     let folder = private.as_ref().map(PrivateFolder::path).or(args.state.as_deref());
     let folder = folder.expect("one of them is there").to_owned();
-    let listener =
-        TcpListener::bind(address).await.with_context(|| format!("cannot listen on {address}"))?;
+    let listener = rtfarm_coordinator::listen(address)
+        .with_context(|| format!("cannot listen on {address}"))?;
     writeln!(io::stdout().lock(), "listening on http://{}", listener.local_addr()?)
         .context("cannot write to standard output")?;
 

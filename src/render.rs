@@ -10,7 +10,7 @@ use anyhow::{Context, anyhow};
 use rtfarm_coordinator::{Config, Coordinator, Job, Keeping, Listener};
 use rtfarm_core::{
     language::draw_diagnostics,
-    render::{Sampling, Tally},
+    render::{DEEPEST, Sampling, Tally},
     tile::Size,
     transfer::Transfer,
 };
@@ -49,13 +49,14 @@ pub(crate) struct Summary {
 }
 
 impl Summary {
-    /// What there is to say of branches that were not traced.
-    fn cut_text(&self) -> String {
-        if self.tally.cut > 0.0 {
-            format!(", at most {:.2} % of a sample cut off", 100.0 * self.tally.cut)
-        } else {
-            String::new()
+    /// What there is to say of light that lies too deep.
+    fn depth_text(&self) -> String {
+        let Tally { samples, untraced, most_untraced, .. } = self.tally;
+        if untraced == 0.0 {
+            return String::new();
         }
+        let [mean, most] = [untraced / samples as f64, most_untraced].map(|share| 100.0 * share);
+        format!(", {mean:.2} % deeper than {DEEPEST} rays (at most {most:.2} % of a sample)")
     }
 
     /// How far off the picture may be.
@@ -82,7 +83,7 @@ impl Summary {
         let mrays = self.tally.rays as f64 / 1e6;
         writeln!(
             io::stdout().lock(),
-            "{size} in {seconds:.2} s, {mrays:.1} Mrays, {rate:.1} Mrays/s, {workers} {noun}, {samples:.1} samples a pixel, {error}{cut}: {path}",
+            "{size} in {seconds:.2} s, {mrays:.1} Mrays, {rate:.1} Mrays/s, {workers} {noun}, {samples:.1} samples a pixel, {error}{depth}: {path}",
             size = self.size,
             seconds = started.elapsed().as_secs_f64(),
             rate = mrays / self.rendering.as_secs_f64().max(1e-9),
@@ -90,7 +91,7 @@ impl Summary {
             noun = if self.workers == 1 { "worker" } else { "workers" },
             samples = self.tally.samples as f64 / self.size.pixel_count() as f64,
             error = self.error_text(),
-            cut = self.cut_text(),
+            depth = self.depth_text(),
             path = output.name().display()
         )
         .context("cannot write to standard output")

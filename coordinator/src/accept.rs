@@ -3,6 +3,7 @@
 use std::{
     future::poll_fn,
     io,
+    net::SocketAddr,
     pin::Pin,
     task::{Context, Poll},
     time::Duration,
@@ -10,6 +11,7 @@ use std::{
 
 use tokio::{
     io::{AsyncRead, AsyncWrite, ReadBuf},
+    net::{TcpListener, TcpSocket},
     sync::mpsc,
     time::{Sleep, sleep},
 };
@@ -24,8 +26,21 @@ const FIRST_PAUSE: Duration = Duration::from_millis(100);
 
 const LONGEST_PAUSE: Duration = Duration::from_secs(1);
 
+/// So many connections may wait in the system's queue, if that allows it: a whole farm may come at
+/// once, and who finds no room tries again a second later.
+const BACKLOG: u32 = 4096;
+
 /// Connections wait for the server so many at a time; the rest waits in the system's queue.
 pub(crate) const WAITING: usize = 16;
+
+/// Listens on an address, with room for a whole farm.
+pub fn listen(address: SocketAddr) -> io::Result<TcpListener> {
+    let socket = if address.is_ipv4() { TcpSocket::new_v4()? } else { TcpSocket::new_v6()? };
+    // The port of a coordinator that ended a moment ago is free.
+    socket.set_reuseaddr(true)?;
+    socket.bind(address)?;
+    socket.listen(BACKLOG)
+}
 
 /// A connection on which the other side has to say something soon.
 #[derive(Debug)]

@@ -217,6 +217,8 @@ pub(crate) enum Notice {
     TakenBack { worker: WorkerId, job: JobId, tiles: Vec<TileId> },
     /// Nobody is there to render tiles again and compare. It is said once.
     NoAudit,
+    /// A tile is not compared any more: workers were lost with it too often.
+    NotCompared(JobId, TileId),
     /// A job failed, for that reason.
     JobFailed(JobId, String),
     /// A client cancelled a job.
@@ -415,6 +417,7 @@ impl Farm {
             let job = loss.lease.job;
             for &tile in &loss.again {
                 if self.audit.on_loss(job, tile) {
+                    actions.push(Action::Log(Notice::NotCompared(job, tile)));
                     self.give_up(job, tile);
                 }
             }

@@ -16,8 +16,9 @@ use crate::{
     tiles::{Arrival, PixelHash, Place, Rendering, Tiles},
 };
 
-/// The longest run of tiles in one lease: a lost worker costs no more than its rendering.
-const LONGEST_RUN: usize = 64;
+/// The longest run of tiles in one lease. Workers ask for as many as they render in a moment: a lost one
+/// costs no more than that.
+const LONGEST_RUN: usize = 1024;
 
 /// The longest run for each thread of a worker of which no tile of the job has come yet: nobody
 /// knows how slow it is.
@@ -373,6 +374,7 @@ impl Leases {
             expires: until,
             quiet_from: None,
         };
+        self.expiries.insert((until, id));
         self.held.insert(id, lease);
         self.index(id);
         run
@@ -381,20 +383,26 @@ impl Leases {
     /// Brings the entries of a lease in `expiries` and `quiet` up to date.
     fn index(&mut self, id: LeaseId) {
         let Some(lease) = self.held.get_mut(&id) else { return };
-        self.expiries.remove(&(lease.expires, id));
         let tiles = lease.begun.values().map(|begun| begun.until);
-        lease.expires = tiles.chain([lease.until]).min().expect("there is one at least");
-        self.expiries.insert((lease.expires, id));
-
-        if let Some(from) = lease.quiet_from.take() {
-            self.quiet.remove(&(from, id));
+        let expires = tiles.chain([lease.until]).min().expect("there is one at least");
+        // Tiles of one message come at one time.
+        if lease.expires != expires {
+            self.expiries.remove(&(lease.expires, id));
+            lease.expires = expires;
+            self.expiries.insert((expires, id));
         }
-        if !lease.alone.is_empty() && !lease.is_lone {
+
+        let quiet_from = (!lease.alone.is_empty() && !lease.is_lone).then(|| {
             let mean = self.jobs[&lease.job].pace.mean();
             let silence = mean.map_or(LONGEST_QUIET, |mean| mean * QUIET_TILES);
-            let from = lease.last_tile + silence.clamp(SHORTEST_QUIET, LONGEST_QUIET);
-            lease.quiet_from = Some(from);
-            self.quiet.insert((from, id));
+            lease.last_tile + silence.clamp(SHORTEST_QUIET, LONGEST_QUIET)
+        });
+        if lease.quiet_from != quiet_from {
+            if let Some(from) = lease.quiet_from {
+                self.quiet.remove(&(from, id));
+            }
+            self.quiet.extend(quiet_from.map(|from| (from, id)));
+            lease.quiet_from = quiet_from;
         }
     }
 
@@ -941,7 +949,7 @@ mod tests {
 
     #[test]
     fn runs_shorten_towards_the_end_and_are_shorter_for_the_slow() {
-        for (cost, longest) in [(COST, LONGEST_RUN), (COST * 10, 12)] {
+        for (cost, longest) in [(COST, 118), (COST * 10, 12)] {
             let (mut leases, start) = job(100, 10);
             let first = leases.on_idle(A, JOB, (1, 4), 1000, start).unwrap();
             assert_eq!(first.tiles.len(), FIRST_RUN, "nobody knows how slow it is");

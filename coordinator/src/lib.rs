@@ -18,6 +18,8 @@ mod farm;
 mod identity;
 mod job;
 mod lease;
+#[cfg(test)]
+mod load;
 mod members;
 mod pace;
 mod record;
@@ -35,6 +37,7 @@ mod store;
 mod tiles;
 mod waiting;
 
+pub use accept::listen;
 pub use farm::Keeping;
 pub use job::Job;
 pub use run::{Coordinator, Listener};

@@ -58,6 +58,8 @@ type Events = Pin<Box<dyn Stream<Item = Result<wire::Event, Status>> + Send>>;
 /// Both services over one coordinator.
 pub(crate) fn router(shell: &Arc<Shell>) -> Router {
     const WINDOW_BYTES: u32 = 1 << 22;
+    // A frame of a delivery; each costs both sides a call of the system.
+    const FRAME_BYTES: u32 = 1 << 17;
     let farm = farm_server::FarmServer::new(FarmService { shell: Arc::clone(shell) })
         .max_decoding_message_size(MESSAGE_BYTES)
         .max_encoding_message_size(MESSAGE_BYTES);
@@ -67,6 +69,7 @@ pub(crate) fn router(shell: &Arc<Shell>) -> Router {
     Server::builder()
         .initial_stream_window_size(WINDOW_BYTES)
         .initial_connection_window_size(WINDOW_BYTES)
+        .max_frame_size(FRAME_BYTES)
         .http2_keepalive_interval(Some(Duration::from_secs(10)))
         .http2_keepalive_timeout(Some(Duration::from_secs(20)))
         .add_service(farm)

@@ -33,7 +33,7 @@ use crate::{
     record::{Plan, Ticket},
     state::{Durability, KeptJob, StateFolder},
     store::SceneFile,
-    tiles::Tiles,
+    tiles::{MOST_LOSSES, Tiles},
     waiting::{Ask, AskId},
 };
 
@@ -148,7 +148,7 @@ struct Works {
 }
 
 enum Work {
-    Log(Notice),
+    Log(Box<Notice>),
     /// Writes tiles into a job's picture.
     Store(Arc<Job>, Vec<(TileId, Bytes, TileRecord)>),
     /// Forgets what is kept of tiles.
@@ -295,14 +295,14 @@ impl Shell {
             Action::Forget(job) => {
                 works.in_order.extend(state.jobs.remove(&job).map(Work::Drop));
             }
-            Action::Log(notice) => works.in_order.push(Work::Log(notice)),
+            Action::Log(notice) => works.in_order.push(Work::Log(Box::new(notice))),
             Action::Stop => self.stop.cancel(),
         }
     }
 
     fn do_work(&self, work: Work) {
         match work {
-            Work::Log(notice) => log(notice),
+            Work::Log(notice) => log(*notice),
             Work::Drop(job) => job.forget(),
             Work::Reopen(job) => job.reopen(),
             Work::Keep(job, terms) => job.keep(terms),
@@ -790,6 +790,11 @@ fn log(notice: Notice) {
         Notice::NoAudit => {
             tracing::warn!("tiles are not compared: nobody is there to render them again");
         }
+        Notice::NotCompared(job, tile) => tracing::warn!(
+            job = job.0,
+            tile = tile.number(),
+            "the tile is not compared: {MOST_LOSSES} workers that rendered it again were lost"
+        ),
         Notice::JobFailed(job, reason) => tracing::warn!(job = job.0, reason, "job failed"),
         Notice::NotGranted { worker, lease, tile, count } => {
             tracing::warn!(

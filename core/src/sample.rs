@@ -68,6 +68,13 @@ impl Sample {
         GatherNumbers(Self { key: mix(self.key ^ node), ..*self })
     }
 
+    /// The number in `0..1` that decides by Russian roulette which of the sample's branches at a
+    /// depth above 0 are followed.
+    pub(crate) fn roulette(&self, depth: u32) -> f64 {
+        // A place's number is mixed, so none is a depth.
+        self.gather_numbers(u64::from(depth)).choice()
+    }
+
     fn numbers<const N: usize>(&self, first_dimension: u32, key: u64) -> [f64; N] {
         let scramble = (key >> 32) as u32;
         std::array::from_fn(|k| {

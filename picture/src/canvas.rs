@@ -231,14 +231,15 @@ impl TileRecord {
     /// they are in the picture.
     fn to_bytes(self, key: &[u8; 32], tile: TileId, pixels: &[u8]) -> [u8; RECORD_BYTES] {
         let Self { arrived, tally, seconds, elapsed, worker_count } = self;
-        let Tally { rays, samples, cut, estimated, variance, capped } = tally;
+        let Tally { rays, samples, untraced, most_untraced, estimated, variance, capped } = tally;
+        let sums = [untraced, most_untraced, variance].map(f64::to_bits);
         let mut bytes = Vec::with_capacity(RECORD_BYTES);
         bytes.extend([DONE, 0, 0, 0]);
         bytes.extend(worker_count.to_le_bytes());
         bytes.extend(seconds.to_le_bytes());
         bytes.extend(elapsed.to_le_bytes());
         bytes.extend(arrived);
-        for count in [rays, samples, estimated, capped, cut.to_bits(), variance.to_bits()] {
+        for count in [rays, samples, estimated, capped].into_iter().chain(sums) {
             bytes.extend(count.to_le_bytes());
         }
         bytes.resize(RECORD_BYTES - CHECKSUM_BYTES, 0);
@@ -266,8 +267,9 @@ impl TileRecord {
                 samples: count(1),
                 estimated: count(2),
                 capped: count(3),
-                cut: f64::from_bits(count(4)),
-                variance: f64::from_bits(count(5)),
+                untraced: f64::from_bits(count(4)),
+                most_untraced: f64::from_bits(count(5)),
+                variance: f64::from_bits(count(6)),
             },
         }
     }
@@ -291,7 +293,15 @@ mod tests {
     fn record(tile: TileId) -> TileRecord {
         TileRecord {
             arrived: [tile.number() as u8; 32],
-            tally: Tally { rays: 1, samples: 2, cut: 0.3, estimated: 4, variance: 0.5, capped: 6 },
+            tally: Tally {
+                rays: 1,
+                samples: 2,
+                untraced: 0.3,
+                most_untraced: 0.2,
+                estimated: 4,
+                variance: 0.5,
+                capped: 6,
+            },
             seconds: 0.25,
             elapsed: tile.number() as f32,
             worker_count: 3,

@@ -3,7 +3,7 @@
 use prost::bytes::Bytes;
 use rtfarm_core::{
     prepared::SceneHash,
-    render::{Cutoff, Quality, SampleLimit, Sampling, Settings, StandardError, Tally},
+    render::{Quality, SampleLimit, Sampling, Settings, StandardError, Tally},
     tile::{Crop, CropError, Size, SizeError},
     transfer::Transfer,
 };
@@ -26,9 +26,6 @@ pub enum WireError {
     /// A number is out of its range.
     #[error("an error of {0} is out of range")]
     Error(f64),
-    /// A number is out of its range.
-    #[error("a cut-off of {0} is out of range")]
-    Cutoff(f64),
     /// There is no such transfer curve.
     #[error("no transfer curve has the number {0}")]
     Transfer(i32),
@@ -89,7 +86,7 @@ impl TryFrom<wire::Quality> for Quality {
     type Error = WireError;
 
     fn try_from(quality: wire::Quality) -> Result<Self, WireError> {
-        let wire::Quality { sampling, seed, flat, secondary, cutoff } = quality;
+        let wire::Quality { sampling, seed, flat, secondary } = quality;
         let sampling = match sampling.ok_or(WireError::Missing("sampling"))? {
             wire::quality::Sampling::Samples(count) => {
                 Sampling::fixed(count).ok_or(WireError::Samples(count))?
@@ -101,14 +98,13 @@ impl TryFrom<wire::Quality> for Quality {
                 }
             }
         };
-        let cutoff = Cutoff::new(cutoff).ok_or(WireError::Cutoff(cutoff))?;
-        Ok(Self { sampling, seed, flat, secondary, cutoff })
+        Ok(Self { sampling, seed, flat, secondary })
     }
 }
 
 impl From<Quality> for wire::Quality {
     fn from(quality: Quality) -> Self {
-        let Quality { sampling, seed, flat, secondary, cutoff } = quality;
+        let Quality { sampling, seed, flat, secondary } = quality;
         let sampling = Some(match sampling {
             Sampling::Fixed(count) => wire::quality::Sampling::Samples(count.get()),
             Sampling::Adaptive { error, most } => {
@@ -116,7 +112,7 @@ impl From<Quality> for wire::Quality {
                 wire::quality::Sampling::Adaptive(wire::Adaptive { error, most })
             }
         });
-        Self { sampling, seed, flat, secondary, cutoff: cutoff.get() }
+        Self { sampling, seed, flat, secondary }
     }
 }
 
@@ -124,18 +120,21 @@ impl TryFrom<wire::Tally> for Tally {
     type Error = WireError;
 
     fn try_from(tally: wire::Tally) -> Result<Self, WireError> {
-        let wire::Tally { rays, samples, cut, estimated, variance, capped } = tally;
-        let is_possible = (0.0..=1.0).contains(&cut) && variance.is_finite() && variance >= 0.0;
-        is_possible
-            .then_some(Self { rays, samples, cut, estimated, variance, capped })
+        let wire::Tally { rays, samples, untraced, estimated, variance, capped, most_untraced } =
+            tally;
+        let is_possible = |sum: f64| sum.is_finite() && sum >= 0.0;
+        [untraced, variance, most_untraced]
+            .into_iter()
+            .all(is_possible)
+            .then_some(Self { rays, samples, untraced, most_untraced, estimated, variance, capped })
             .ok_or(WireError::Tally)
     }
 }
 
 impl From<Tally> for wire::Tally {
     fn from(tally: Tally) -> Self {
-        let Tally { rays, samples, cut, estimated, variance, capped } = tally;
-        Self { rays, samples, cut, estimated, variance, capped }
+        let Tally { rays, samples, untraced, most_untraced, estimated, variance, capped } = tally;
+        Self { rays, samples, untraced, estimated, variance, capped, most_untraced }
     }
 }
 
@@ -222,13 +221,8 @@ mod tests {
     #[test]
     fn settings_out_of_range_are_refused() {
         use wire::quality::Sampling::{Adaptive, Samples};
-        let quality = wire::Quality {
-            sampling: Some(Samples(1)),
-            seed: 9,
-            flat: true,
-            secondary: false,
-            cutoff: 0.5,
-        };
+        let quality =
+            wire::Quality { sampling: Some(Samples(1)), seed: 9, flat: true, secondary: false };
         let frame = wire::Frame { width: 2, height: 3 };
         let good = wire::Settings { frame: Some(frame), quality: Some(quality) };
         let settings = Settings::try_from(good).unwrap();
@@ -240,8 +234,6 @@ mod tests {
         let adaptive = |error, most| Some(Adaptive(wire::Adaptive { error, most }));
         Quality::try_from(wire::Quality { sampling: adaptive(0.1, 8), ..quality }).unwrap();
         for bad in [
-            wire::Quality { cutoff: f64::NAN, ..quality },
-            wire::Quality { cutoff: 2.0, ..quality },
             wire::Quality { sampling: None, ..quality },
             wire::Quality { sampling: Some(Samples(0)), ..quality },
             wire::Quality { sampling: Some(Samples(65_537)), ..quality },

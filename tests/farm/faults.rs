@@ -191,13 +191,7 @@ impl Fault {
 
     /// Whether an order may fail for it: it has to end well for all others.
     fn excuses_a_failure(self) -> bool {
-        matches!(
-            self,
-            Self::CoordinatorKilled
-                | Self::ClientInterrupted
-                | Self::DiskFull
-                | Self::NoDescriptors
-        )
+        matches!(self, Self::ClientInterrupted | Self::DiskFull | Self::NoDescriptors)
     }
 
     fn name(self) -> String {

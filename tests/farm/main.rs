@@ -847,6 +847,8 @@ fn a_second_interruption_ends_a_submit_at_once() {
     let args = ["submit", "scene.rt", "-o", "out.png", "--coordinator", &url];
     let mut submit = place.start("submit.log", &args);
     poll(|| coordinator.log().contains("job started").then_some(()));
+    // The answer goes out after that line.
+    thread::sleep(Duration::from_millis(500));
     coordinator.signal(Signal::STOP);
     submit.signal(Signal::INT);
     thread::sleep(Duration::from_millis(300));

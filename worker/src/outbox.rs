@@ -1,22 +1,13 @@
 //! Carries finished tiles from the threads that render to where the worker decides.
 
-use std::{
-    sync::{Mutex, MutexGuard, PoisonError},
-    time::Duration,
-};
+use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use tokio::{
     sync::Notify,
     time::{Instant, sleep_until},
 };
 
-use crate::{call::Delivery, task::TaskId};
-
-/// Finished tiles are taken no more often than this while the threads have others to render.
-pub(crate) const TURN: Duration = Duration::from_millis(10);
-
-/// A rendering that has ended; it has no pixels if it was stopped.
-pub(crate) type Rendered = (TaskId, Option<Delivery>);
+use crate::task::{Rendered, TURN};
 
 /// Tiles that the threads are done with. They wait for each other for a turn at most, and for nobody
 /// when a thread is about to have nothing to do.
@@ -87,6 +78,7 @@ mod tests {
     use tokio::time::{advance, timeout};
 
     use super::*;
+    use crate::task::TaskId;
 
     /// Says whether tiles are due within that time.
     async fn is_due(outbox: &Outbox, time: Duration) -> bool {

@@ -12,7 +12,7 @@ use rtfarm_core::{prepared::SceneHash, tile::TileId};
 use rtfarm_proto::LeaseName;
 
 use crate::{
-    call::{Call, CallError, CallErrorKind},
+    call::{Call, CallError, CallErrorKind, Delivery},
     error::WorkerError,
     job::Job,
 };
@@ -21,6 +21,12 @@ use crate::{
 /// report that comes too late is known.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub(crate) struct TaskId(u64);
+
+/// A rendering that has ended; it has no pixels if it was stopped.
+pub(crate) type Rendered = (TaskId, Option<Delivery>);
+
+/// Finished tiles are heard of no more often than this while the threads have others to render.
+pub(crate) const TURN: Duration = Duration::from_millis(10);
 
 /// What the shell is to do.
 #[derive(Debug)]

@@ -17,10 +17,9 @@ use crate::{
     config::Config,
     error::WorkerError,
     job::Job,
-    outbox::{Rendered, TURN},
     pulse::Object,
     scene::SceneError,
-    task::{Action, GivenUp, TaskId, Tasks},
+    task::{Action, GivenUp, Rendered, TURN, TaskId, Tasks},
 };
 
 /// Turns of tiles that a thread may have before it, so that it never waits for the network. As many

@@ -126,6 +126,9 @@ fn found(actions: &[Action]) -> Vec<String> {
             Some(format!("{tiles:?} of {worker}"))
         }
         Action::Log(Notice::NoAudit) => Some("no audit".to_owned()),
+        Action::Log(Notice::NotCompared(_, tile)) => {
+            Some(format!("{} is not compared", tile.number()))
+        }
         Action::Log(Notice::JobFailed(_, reason)) => Some(reason.clone()),
         _ => None,
     };
@@ -474,6 +477,21 @@ fn a_job_does_not_wait_for_a_comparison_that_does_not_come() {
         let most = if is_stopped { 3 * TERM } else { LONGEST_SILENCE + TERM };
         assert!((most / 2..=most).contains(&waited), "{waited:?}");
     }
+}
+
+#[test]
+fn a_tile_of_which_workers_that_compare_it_are_lost_is_not_compared_which_is_said() {
+    let mut world = World::with_audit(1.0);
+    let worker = world.join();
+    let others = [(); 3].map(|()| (world.join(), world.last_number as u32));
+    world.submit(1);
+    let run = world.lease(worker);
+    let mut told = found(&world.stitch(worker, &run));
+    for (other, process) in others {
+        assert_eq!(world.lease(other).tiles, run.tiles, "it compares");
+        told.extend(found(&world.farm.on_process_exit(process, "killed by signal 11", world.now)));
+    }
+    assert_eq!(told, [format!("{} is not compared", run.tiles[0].number())]);
 }
 
 #[test]

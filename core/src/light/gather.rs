@@ -2,6 +2,8 @@
 //! now and then, and where the ray meets such a face, that place is lit in its turn and gives what
 //! it can.
 
+use std::ops::ControlFlow;
+
 use super::{
     importance::Receiver,
     sampling::{self, LightSample},
@@ -15,14 +17,14 @@ use crate::{
         ray_differential::SurfaceFootprint,
     },
     trace::{
-        batch::trace,
+        batch::{OnProgress, trace},
         ray::{Hit, Ray},
     },
 };
 
 /// The most faces that let light through on one ray: far more than any scene has, so that
 /// rounding cannot keep a ray between two faces for ever.
-const MOST_CROSSINGS: u32 = 1 << 12;
+pub(crate) const MOST_CROSSINGS: u32 = 1 << 12;
 
 /// A point of at least this weight in its sample always gathers; the survival probability of others
 /// falls in proportion to their weight. Light behind mirrors costs as much as any, and its noise is
@@ -81,16 +83,8 @@ impl Queue {
 }
 
 impl Gatherer {
-    /// Sends a ray from every point that survives and finds the sources that it meets; the answer
-    /// is how many rays that took.
-    pub(crate) fn find_sources(
-        &mut self,
-        view: &View<'_>,
-        isa: Isa,
-        points: &[Point],
-        samples: &[Sample],
-    ) -> u64 {
-        self.sources.clear();
+    /// Makes a ray from every point that survives.
+    pub(crate) fn start(&mut self, view: &View<'_>, points: &[Point], samples: &[Sample]) {
         self.queue.clear();
         for (k, point) in points.iter().enumerate() {
             let numbers = samples[point.sample].gather_numbers(point.node);
@@ -110,23 +104,28 @@ impl Gatherer {
             let throughput = 1.0 / survival;
             self.queue.push(ray, Path { point: k, receiver, sample, throughput, distance: 0.0 });
         }
-        let mut ray_count = 0;
-        for _ in 0..=MOST_CROSSINGS {
-            if self.queue.rays.is_empty() {
-                break;
+    }
+
+    /// Follows the rays to the next face, where sources may lie: one at most for each ray. Gives
+    /// how many rays are followed; 0 when all have ended.
+    pub(crate) fn find_sources(
+        &mut self,
+        view: &View<'_>,
+        isa: Isa,
+        on_progress: OnProgress<'_>,
+    ) -> ControlFlow<(), u64> {
+        self.sources.clear();
+        trace(view, isa, &self.queue.rays, &mut self.hits, on_progress)?;
+        self.next.clear();
+        for k in 0..self.queue.rays.len() {
+            let (ray, hit, path) = (self.queue.rays[k], self.hits[k], self.queue.paths[k]);
+            if hit.is_some() {
+                self.meet(view, &ray, &hit, path);
             }
-            ray_count += self.queue.rays.len() as u64;
-            trace(view, isa, &self.queue.rays, &mut self.hits);
-            self.next.clear();
-            for k in 0..self.queue.rays.len() {
-                let (ray, hit, path) = (self.queue.rays[k], self.hits[k], self.queue.paths[k]);
-                if hit.is_some() {
-                    self.meet(view, &ray, &hit, path);
-                }
-            }
-            std::mem::swap(&mut self.queue, &mut self.next);
         }
-        ray_count
+        let ray_count = self.queue.rays.len() as u64;
+        std::mem::swap(&mut self.queue, &mut self.next);
+        ControlFlow::Continue(ray_count)
     }
 
     /// Takes in that a ray has met a face: it may be a source, and may let the ray through.
@@ -173,8 +172,7 @@ impl Gatherer {
         }
     }
 
-    /// Gives the receivers what the sources, which are lit now, send them. A receiver adds it up in
-    /// the order in which its ray met them.
+    /// Gives the receivers what the latest sources, which are lit now, send them.
     pub(crate) fn deliver(&self, points: &mut [Point]) {
         for source in &self.sources {
             points[source.sample].light += source.weight * (source.color * source.light);

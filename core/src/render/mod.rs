@@ -9,19 +9,18 @@ mod pixel;
 mod sampler;
 mod settings;
 mod tally;
+pub(crate) mod trees;
 mod unseen;
 mod wavefront;
 
 use std::ops::ControlFlow;
 
-use self::sampler::Sampler;
+use self::{sampler::Sampler, wavefront::Wavefront};
 
-pub use self::tally::Tally;
+pub use self::{tally::Tally, wavefront::DEEPEST};
 use crate::{isa::Isa, prepared::PreparedScene, tile::Area};
 
-pub use self::settings::{
-    Cutoff, Quality, SampleCount, SampleLimit, Sampling, Settings, StandardError,
-};
+pub use self::settings::{Quality, SampleCount, SampleLimit, Sampling, Settings, StandardError};
 
 /// A rendered tile.
 #[derive(Debug, Clone, PartialEq)]
@@ -42,8 +41,21 @@ pub fn render_tile<B: AsRef<[u8]>>(
     isa: Isa,
     on_progress: &mut dyn FnMut() -> ControlFlow<()>,
 ) -> Option<RenderedTile> {
+    render(scene, quality, area, isa, None, on_progress)
+}
+
+/// Renders as [`render_tile`] does. With a cut-off there is no roulette: branches below that weight
+/// count as background, which is biased.
+fn render<B: AsRef<[u8]>>(
+    scene: &PreparedScene<B>,
+    quality: &Quality,
+    area: Area,
+    isa: Isa,
+    cutoff: Option<f64>,
+    on_progress: &mut dyn FnMut() -> ControlFlow<()>,
+) -> Option<RenderedTile> {
     let view = scene.view();
-    let mut sampler = Sampler::new(&view, quality, isa, on_progress);
+    let mut sampler = Sampler::new(&view, quality, isa, Wavefront::new(cutoff), on_progress);
     let ControlFlow::Continue(pixels) = sampler.sample(area) else { return None };
     let mut tally = sampler.tally();
     for pixel in &pixels {

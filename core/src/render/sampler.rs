@@ -37,9 +37,10 @@ impl<'a> Sampler<'a> {
         view: &'a View<'a>,
         quality: &'a Quality,
         isa: Isa,
+        wavefront: Wavefront,
         on_progress: &'a mut dyn FnMut() -> ControlFlow<()>,
     ) -> Self {
-        let (wavefront, tally) = (Wavefront::default(), Tally::default());
+        let tally = Tally::default();
         Self { view, quality, isa, on_progress, wavefront, tally }
     }
 
@@ -182,7 +183,10 @@ impl<'a> Sampler<'a> {
             if let Some(hits) = &mut hits {
                 hits.extend_from_slice(self.wavefront.first_hits());
             }
-            self.tally.cut = self.tally.cut.max(self.wavefront.most_untraced());
+            for &weight in self.wavefront.untraced() {
+                self.tally.untraced += weight;
+                self.tally.most_untraced = self.tally.most_untraced.max(weight);
+            }
         }
         ControlFlow::Continue(())
     }

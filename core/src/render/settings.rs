@@ -27,21 +27,13 @@ pub struct Quality {
     pub flat: bool,
     /// Surfaces that mirror light others.
     pub secondary: bool,
-    /// A mirrored or transmitted branch whose weight in its sample is below this is not traced:
-    /// it counts as background.
-    pub cutoff: Cutoff,
 }
 
 impl Default for Quality {
     fn default() -> Self {
         let (error, most) = (StandardError::EIGHT_BIT_STEP, SampleLimit::DEFAULT);
-        Self {
-            sampling: Sampling::Adaptive { error, most },
-            seed: 0,
-            flat: false,
-            secondary: true,
-            cutoff: Cutoff::DEFAULT,
-        }
+        let sampling = Sampling::Adaptive { error, most };
+        Self { sampling, seed: 0, flat: false, secondary: true }
     }
 }
 
@@ -164,31 +156,6 @@ impl fmt::LowerExp for StandardError {
 }
 
 impl fmt::Display for StandardError {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        fmt::Display::fmt(&self.0, f)
-    }
-}
-
-/// The weight in its sample from which on a branch is traced: 0..=1.
-#[derive(Debug, Clone, Copy, PartialEq, PartialOrd)]
-pub struct Cutoff(f64);
-
-impl Cutoff {
-    /// The cut-off where nobody chose one: a sixteenth of an 8-bit step.
-    pub const DEFAULT: Self = Self(1.0 / 4096.0);
-
-    /// `None` for a number outside 0..=1.
-    pub fn new(weight: f64) -> Option<Self> {
-        (0.0..=1.0).contains(&weight).then_some(Self(weight))
-    }
-
-    /// The weight.
-    pub fn get(self) -> f64 {
-        self.0
-    }
-}
-
-impl fmt::Display for Cutoff {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         fmt::Display::fmt(&self.0, f)
     }

@@ -7,8 +7,11 @@ pub struct Tally {
     pub rays: u64,
     /// Camera rays among them.
     pub samples: u64,
-    /// The largest sum of weights of branches that were not traced, in any sample. 0..=1.
-    pub cut: f64,
+    /// The sum over all samples of the weights of branches that were not traced but count as
+    /// background: they lie deeper than [`DEEPEST`](super::DEEPEST).
+    pub untraced: f64,
+    /// The most of it in any sample.
+    pub most_untraced: f64,
     /// Pixels whose error was estimated.
     pub estimated: u64,
     /// The sum of those pixels' estimated variances, each the mean of its channels'.
@@ -22,7 +25,8 @@ impl Tally {
     pub fn add(&mut self, other: &Self) {
         self.rays += other.rays;
         self.samples += other.samples;
-        self.cut = self.cut.max(other.cut);
+        self.untraced += other.untraced;
+        self.most_untraced = self.most_untraced.max(other.most_untraced);
         self.estimated += other.estimated;
         self.variance += other.variance;
         self.capped += other.capped;

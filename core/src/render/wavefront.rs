@@ -13,7 +13,7 @@ use super::settings::Quality;
 use crate::{
     isa::Isa,
     left_out,
-    light::gather::Gatherer,
+    light::gather::{Gatherer, MOST_CROSSINGS},
     prepared::{layout::View, record::Surface},
     sample::{Sample, node_after},
     shade::{
@@ -23,13 +23,20 @@ use crate::{
     },
     tile::Size,
     trace::{
-        batch::{trace, trace_shadows},
+        batch::{OnProgress, trace, trace_shadows},
         ray::{Hit, Ray},
     },
 };
 
 /// The depth of the last rays that are traced; camera rays have depth 0.
-const DEEPEST: u32 = 64;
+pub const DEEPEST: u32 = 64;
+
+/// A branch of at least this weight in its sample is always followed. Lighter ones are by chance, and
+/// then weigh as much. The noise that this adds to a sample is about half of it.
+const FULL_WEIGHT: f64 = 1.0 / 256.0;
+
+/// A queue of more rays than this is worked through in parts, as long as it has several samples.
+const MOST_RAYS: usize = 4096;
 
 /// A camera ray that is wanted.
 #[derive(Debug, Clone, Copy)]
@@ -47,11 +54,13 @@ pub(super) struct CameraSample {
 /// Samples on their way, and the queues that they pass through.
 #[derive(Debug, Default)]
 pub(super) struct Wavefront {
-    /// The random numbers of each sample; empty where no light is gathered.
+    /// The random numbers of each sample; empty where none are needed.
     samples: Vec<Sample>,
-    /// The rays of the current depth, and those of the next.
+    /// The rays of the current depth, and those of the next. A sample's rays stand together.
     queue: RayQueue,
     next_queue: RayQueue,
+    /// Samples that wait until those of the queue are done, with their rays.
+    put_off: Vec<RayQueue>,
     hits: Vec<Hit>,
     points: Vec<Point>,
     shadow_rays: Vec<Ray>,
@@ -64,9 +73,18 @@ pub(super) struct Wavefront {
     first_hits: Vec<Hit>,
     /// What each sample sees.
     colors: Vec<DVec3>,
-    /// For each sample, the weight of its branches that were not traced.
+    /// Branches below this weight count as background; `None`: roulette decides about the light ones.
+    cutoff: Option<f64>,
+    roulette: Roulette,
+    /// For each sample, the weight of its branches that were not traced but count as background.
     untraced: Vec<f64>,
 }
+
+// 2048 samples are halved 11 times, and a part that waits has at most two rays for each traced one.
+const _: () = assert!(
+    12 * 2 * MOST_RAYS * (size_of::<Ray>() + size_of::<Branch>() + size_of::<RayDifferential>())
+        <= 20 << 20
+);
 
 /// Rays that wait to be traced, and what travels with each.
 #[derive(Debug, Default)]
@@ -103,11 +121,54 @@ impl Branch {
     }
 }
 
+/// Russian roulette among a sample's branches of one depth that are lighter than [`FULL_WEIGHT`]:
+/// in a row, each as long as its weight, they are combed with a tooth every [`FULL_WEIGHT`] from a
+/// random start on, and those that a tooth meets survive. So each survives with the probability
+/// weight / `FULL_WEIGHT`, and all together keep their weight within one tooth.
+///
+/// Sources: a range of weights that paths are brought into by roulette, Vorba & Křivánek,
+/// "Adjoint-driven Russian roulette and splitting in light transport simulation" (2016); the comb,
+/// Booth, "A Weight (Charge) Conserving Importance-Weighted Comb for Monte Carlo" (1996).
+#[derive(Debug, Default)]
+struct Roulette {
+    sample: Option<usize>,
+    /// How far the row has come since the last tooth, in units of [`FULL_WEIGHT`]: 0..1.
+    sum: f64,
+}
+
+impl Roulette {
+    /// Whether the next light branch survives.
+    fn survives(&mut self, branch: &Branch, samples: &[Sample]) -> bool {
+        if self.sample != Some(branch.sample) {
+            let sum = samples[branch.sample].roulette(branch.depth);
+            *self = Self { sample: Some(branch.sample), sum };
+        }
+        self.sum += branch.weight * (1.0 / FULL_WEIGHT);
+        let survives = self.sum >= 1.0;
+        if survives {
+            self.sum -= 1.0;
+        }
+        survives
+    }
+}
+
 impl RayQueue {
     fn clear(&mut self) {
         self.rays.clear();
         self.branches.clear();
         self.differentials.clear();
+    }
+
+    /// Splits the later half of the samples off, with all their rays.
+    fn split_samples(&mut self) -> Option<Self> {
+        let [first, .., last] = &self.branches[..] else { return None };
+        let middle = first.sample.midpoint(last.sample);
+        let kept = self.branches.partition_point(|branch| branch.sample <= middle);
+        (kept < self.branches.len()).then(|| Self {
+            rays: self.rays.split_off(kept),
+            branches: self.branches.split_off(kept),
+            differentials: self.differentials.split_off(kept.min(self.differentials.len())),
+        })
     }
 
     #[inline(always)]
@@ -121,6 +182,11 @@ impl RayQueue {
 }
 
 impl Wavefront {
+    /// One with roulette, unless branches below a weight count as background.
+    pub(super) fn new(cutoff: Option<f64>) -> Self {
+        Self { cutoff, ..Self::default() }
+    }
+
     /// What each camera ray met, in the order of the samples.
     pub(super) fn first_hits(&self) -> &[Hit] {
         &self.first_hits
@@ -131,9 +197,9 @@ impl Wavefront {
         &self.colors
     }
 
-    /// The largest weight of branches that were not traced, in any sample: 0..=1.
-    pub(super) fn most_untraced(&self) -> f64 {
-        self.untraced.iter().copied().fold(0.0, f64::max)
+    /// For each sample, the weight of its branches that were not traced but count as background.
+    pub(super) fn untraced(&self) -> &[f64] {
+        &self.untraced
     }
 
     /// Queues the camera rays of `samples`.
@@ -145,14 +211,14 @@ impl Wavefront {
         samples: impl Iterator<Item = CameraSample>,
     ) {
         let camera = &view.header.camera;
-        let gathers = gathers(view, quality);
+        let needs_numbers = gathers(view, quality) || view.header.features.has_branches();
         let has_textures = view.header.features.has_textures();
         let screen = [camera.top_left, camera.right, camera.down].map(DVec3::from_array);
         self.queue.clear();
         self.samples.clear();
         let (all_samples, differentials) = (&mut self.samples, &mut self.queue.differentials);
         self.queue.rays.extend(samples.map(|CameraSample { x, y, sample, width }| {
-            if gathers {
+            if needs_numbers {
                 all_samples.push(sample);
             }
             let [across, down] = sample.position();
@@ -189,22 +255,29 @@ impl Wavefront {
         view: &View<'_>,
         quality: &Quality,
         isa: Isa,
-        on_progress: &mut dyn FnMut() -> ControlFlow<()>,
+        on_progress: OnProgress<'_>,
     ) -> ControlFlow<(), u64> {
         let background = DVec3::from_array(view.header.lighting.background);
         let mut ray_count = 0;
         let mut is_first = true;
-        while !self.queue.rays.is_empty() {
-            on_progress()?;
-            trace(view, isa, &self.queue.rays, &mut self.hits);
+        loop {
+            if self.queue.rays.is_empty() {
+                let Some(queue) = self.put_off.pop() else { break };
+                self.queue = queue;
+            }
+            while self.queue.rays.len() > MOST_RAYS {
+                let Some(later) = self.queue.split_samples() else { break };
+                self.put_off.push(later);
+            }
+            trace(view, isa, &self.queue.rays, &mut self.hits, on_progress)?;
             if std::mem::take(&mut is_first) {
                 self.first_hits.clone_from(&self.hits);
             }
             ray_count += self.queue.rays.len() as u64;
-            self.meet_all(view, quality.cutoff.get());
-            ray_count += self.light_points(view, quality.flat, isa);
+            self.meet_all(view);
+            ray_count += self.light_points(view, quality.flat, isa, on_progress)?;
             if gathers(view, quality) {
-                ray_count += self.gather(view, isa);
+                ray_count += self.gather(view, isa, on_progress)?;
             }
             for point in &self.points {
                 self.colors[point.sample] += point.weight * (point.color * point.light);
@@ -218,33 +291,34 @@ impl Wavefront {
     }
 
     /// Takes in what the queue's rays have met: fills the points and the next queue.
-    fn meet_all(&mut self, view: &View<'_>, cutoff: f64) {
+    fn meet_all(&mut self, view: &View<'_>) {
         let background = DVec3::from_array(view.header.lighting.background);
         let has_textures = view.header.features.has_textures();
         self.points.clear();
         self.next_queue.clear();
+        self.roulette = Roulette::default();
         for index in 0..self.queue.rays.len() {
             if !self.hits[index].is_some() {
                 let branch = &self.queue.branches[index];
                 self.colors[branch.sample] += branch.weight * background;
             } else if has_textures {
-                self.meet::<true>(view, index, cutoff);
+                self.meet::<true>(view, index);
             } else {
-                self.meet::<false>(view, index, cutoff);
+                self.meet::<false>(view, index);
             }
         }
     }
 
     /// Ray `index` has met a face: finds the surface, shades it, and branches.
     #[inline(always)]
-    fn meet<const HAS_TEXTURES: bool>(&mut self, view: &View<'_>, index: usize, cutoff: f64) {
+    fn meet<const HAS_TEXTURES: bool>(&mut self, view: &View<'_>, index: usize) {
         let (ray, branch) = (self.queue.rays[index], self.queue.branches[index]);
         let at = Interaction::new(view, &ray, &self.hits[index]);
         let differential = HAS_TEXTURES
             .then(|| self.queue.differentials[index].transfer(ray.direction, at.t, at.normal));
         self.shade(view, &ray, branch, &at, differential);
         if view.header.features.has_branches() {
-            self.branch(view, &ray, branch, &at, differential, cutoff);
+            self.branch(view, &ray, branch, &at, differential);
         }
     }
 
@@ -284,20 +358,14 @@ impl Wavefront {
         branch: Branch,
         at: &Interaction<'_>,
         differential: Option<RayDifferential>,
-        cutoff: f64,
     ) {
         let (reflect, alpha, index) = (at.material.reflect, at.material.alpha, at.material.refract);
         let cosine = -at.normal.dot(ray.direction);
-        let mirrored = mirror(ray.direction, at.normal, cosine);
         let curvature = if differential.is_some() { at.curvature(view) } else { 0.0 };
-        let mirrored_differential =
-            differential.map(|it| it.mirror(ray.direction, at.normal, curvature));
-        let reflected = at.leave(mirrored, Ray::NOTHING_AHEAD);
-        if reflect > 0.0 && !left_out::MIRROR {
-            self.follow(reflected, branch.next(reflect, 1), mirrored_differential, cutoff);
-        }
+        let mut mirrored_share = if left_out::MIRROR { 0.0 } else { reflect };
+        let mut transmitted = None;
         if reflect < 1.0 && alpha < 1.0 && !left_out::TRANSPARENCY {
-            let transmitted = branch.next((1.0 - reflect) * (1.0 - alpha), 2);
+            let share = (1.0 - reflect) * (1.0 - alpha);
             let ratio = if at.is_front { index } else { 1.0 / index };
             let is_straight = left_out::REFRACTION || index == 0.0 || index == 1.0;
             let bent = if is_straight {
@@ -311,51 +379,91 @@ impl Wavefront {
                         it.refract(ray.direction, at.normal, curvature, ratio)
                     };
                     let bent = if is_straight { differential } else { differential.map(refract) };
-                    self.follow(at.leave(direction, at.rank), transmitted, bent, cutoff);
+                    transmitted = Some((at.leave(direction, at.rank), branch.next(share, 2), bent));
                 }
                 // Total reflection.
-                None => self.follow(reflected, transmitted, mirrored_differential, cutoff),
+                None => mirrored_share += share,
             }
+        }
+        if mirrored_share > 0.0 {
+            let mirrored = at.leave(mirror(ray.direction, at.normal, cosine), Ray::NOTHING_AHEAD);
+            let differential =
+                differential.map(|it| it.mirror(ray.direction, at.normal, curvature));
+            self.follow(mirrored, branch.next(mirrored_share, 1), differential);
+        }
+        if let Some((ray, branch, differential)) = transmitted {
+            self.follow(ray, branch, differential);
         }
     }
 
-    /// Queues a ray, unless its branch counts too little or lies too deep.
+    /// Queues a ray, unless its branch lies too deep, or counts little and does not survive.
     #[inline(always)]
-    fn follow(
-        &mut self,
-        ray: Ray,
-        branch: Branch,
-        differential: Option<RayDifferential>,
-        cutoff: f64,
-    ) {
-        if branch.weight < cutoff || branch.depth > DEEPEST {
+    fn follow(&mut self, ray: Ray, mut branch: Branch, differential: Option<RayDifferential>) {
+        if branch.depth > DEEPEST || self.cutoff.is_some_and(|cutoff| branch.weight < cutoff) {
             self.untraced[branch.sample] += branch.weight;
-        } else {
-            self.next_queue.push(ray, branch, differential);
+            return;
         }
+        if branch.weight < FULL_WEIGHT && self.cutoff.is_none() {
+            if !self.roulette.survives(&branch, &self.samples) {
+                return;
+            }
+            branch.weight = FULL_WEIGHT;
+        }
+        self.next_queue.push(ray, branch, differential);
     }
 
     /// Finds the light that the points receive; how many rays that took.
-    fn light_points(&mut self, view: &View<'_>, flat: bool, isa: Isa) -> u64 {
+    fn light_points(
+        &mut self,
+        view: &View<'_>,
+        flat: bool,
+        isa: Isa,
+        on_progress: OnProgress<'_>,
+    ) -> ControlFlow<(), u64> {
         if flat || view.header.features.is_lit == 0 {
             self.points.iter_mut().for_each(|point| point.light = DVec3::ONE);
-            return 0;
+            return ControlFlow::Continue(0);
         }
-        (0..view.lights.len()).map(|index| self.light(view, index, isa)).sum()
+        let mut ray_count = 0;
+        for index in 0..view.lights.len() {
+            ray_count += self.light(view, index, isa, on_progress)?;
+        }
+        ControlFlow::Continue(ray_count)
     }
 
     /// Adds the light that other faces send on to the points; how many rays that took.
-    fn gather(&mut self, view: &View<'_>, isa: Isa) -> u64 {
-        let mut ray_count = self.gatherer.find_sources(view, isa, &self.points, &self.samples);
-        std::mem::swap(&mut self.points, &mut self.gatherer.sources);
-        ray_count += self.light_points(view, false, isa);
-        std::mem::swap(&mut self.points, &mut self.gatherer.sources);
-        self.gatherer.deliver(&mut self.points);
-        ray_count
+    fn gather(
+        &mut self,
+        view: &View<'_>,
+        isa: Isa,
+        on_progress: OnProgress<'_>,
+    ) -> ControlFlow<(), u64> {
+        let mut ray_count = 0;
+        self.gatherer.start(view, &self.points, &self.samples);
+        for _ in 0..=MOST_CROSSINGS {
+            match self.gatherer.find_sources(view, isa, on_progress)? {
+                0 => break,
+                count => ray_count += count,
+            }
+            if !self.gatherer.sources.is_empty() {
+                std::mem::swap(&mut self.points, &mut self.gatherer.sources);
+                ray_count += self.light_points(view, false, isa, on_progress)?;
+                std::mem::swap(&mut self.points, &mut self.gatherer.sources);
+                self.gatherer.deliver(&mut self.points);
+            }
+        }
+        ControlFlow::Continue(ray_count)
     }
 
     /// Adds what light `index` gives each point; how many rays that took.
-    fn light(&mut self, view: &View<'_>, index: usize, isa: Isa) -> u64 {
+    fn light(
+        &mut self,
+        view: &View<'_>,
+        index: usize,
+        isa: Isa,
+        on_progress: OnProgress<'_>,
+    ) -> ControlFlow<(), u64> {
+        on_progress()?;
         let light = &view.lights[index];
         let [position, intensity] = [light.position, light.intensity].map(DVec3::from_array);
         let on_light = view.coincident_surfaces(light);
@@ -378,11 +486,11 @@ impl Wavefront {
                 });
             }
         }
-        trace_shadows(view, isa, light, &self.shadow_rays, &mut self.shares);
+        trace_shadows(view, isa, light, &self.shadow_rays, &mut self.shares, on_progress)?;
         for (&(point, arrival), &share) in self.arrivals.iter().zip(&self.shares) {
             self.points[point].light += share * arrival;
         }
-        self.shadow_rays.len() as u64
+        ControlFlow::Continue(self.shadow_rays.len() as u64)
     }
 }
 

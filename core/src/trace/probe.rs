@@ -1,5 +1,7 @@
 //! Single rays, for tests and benchmarks.
 
+use std::ops::ControlFlow;
+
 use glam::DVec3;
 
 use super::{
@@ -101,7 +103,8 @@ impl<B: AsRef<[u8]>> Probing for PreparedScene<B> {
         let view = self.view();
         let rays: Vec<Ray> = probes.iter().map(|probe| to_ray(&view, probe)).collect();
         let mut hits = Vec::with_capacity(rays.len());
-        trace(&view, isa, &rays, &mut hits);
+        let go_on = &mut || ControlFlow::Continue(());
+        let _ = trace(&view, isa, &rays, &mut hits, go_on);
         hits.iter().map(|hit| from_hit(&view, hit)).collect()
     }
 

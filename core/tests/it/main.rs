@@ -1,5 +1,6 @@
 //! Everything that is tested of the core from outside, in one program: it is built and linked once.
 
+mod branches;
 mod catalogue;
 mod corpora;
 mod damage;

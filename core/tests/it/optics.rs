@@ -20,7 +20,7 @@ use rtfarm_oracle::{
 
 use crate::support::{
     parts::{join, sphere, upright},
-    studio::{picture, pixels, prepared, read, settings, whole},
+    studio::{picture, pixels, prepared, read, settings, tree_picture, whole},
 };
 
 /// A screen of 2 x 2 at z = 2.5, seen from z = 5.
@@ -51,6 +51,11 @@ fn rendered(scene: &Scene, side: u64) -> RenderedTile {
         .unwrap()
 }
 
+/// The same without roulette.
+fn tree(scene: &Scene, side: u64) -> Vec<[f32; 3]> {
+    tree_picture(scene, &settings(side, side, 1))
+}
+
 fn side() -> u64 {
     side_of(100_000)
 }
@@ -58,32 +63,6 @@ fn side() -> u64 {
 /// The side of a picture that takes this many rays, or more if asked for.
 fn side_of(count: usize) -> u64 {
     rays(count).isqrt() as u64
-}
-
-#[test]
-fn parallel_mirrors_add_up_a_geometric_series_and_report_the_rest() {
-    for share in [0.25, 0.5, 0.9, 0.99, 1.0] {
-        let materials = format!("entry name mirror reflect {share:?} endentry");
-        let mirrors = pane(0.0, 1e6, true, "mirror") + &pane(6.0, 1e6, false, "mirror");
-        let tile = rendered(&scene(&materials, "", &mirrors), 32);
-        let mut rest = share;
-        let mut depth = 1;
-        while rest >= 1.0 / 4096.0 && depth < 65 {
-            rest *= share;
-            depth += 1;
-        }
-        assert!(
-            (tile.tally.cut - rest).abs() < 1e-14,
-            "{share}: {} cut, truly {rest}",
-            tile.tally.cut
-        );
-        for pixel in tile.pixels {
-            let error = (f64::from(pixel[0]) - (1.0 - rest)).abs();
-            assert!(error < 1e-7, "{share}: {pixel:?}, truly {}", 1.0 - rest);
-        }
-    }
-    HardCase::ParallelMirrors
-        .tell("parallel mirrors add up a geometric series", "right within a rounding");
 }
 
 #[test]
@@ -111,11 +90,10 @@ fn a_mirror_shows_the_mirrored_scene() {
         let lights =
             |sign: f64| format!("ambient 0.2 point coords 1 5 {:?} power 9 endpoint", 7.0 * sign);
         let mirror = pane(0.0, 1e3, true, "mirror");
-        let mirrored =
-            rendered(&scene(glass, &lights(1.0), &(mirror + &geometry(1.0))), side() / 2);
-        let straight = rendered(&scene(glass, &lights(-1.0), &geometry(-1.0)), side() / 2);
-        assert!(straight.pixels.iter().filter(|pixel| **pixel != [0.0; 3]).count() > 1000);
-        for (k, (m, s)) in mirrored.pixels.iter().zip(&straight.pixels).enumerate() {
+        let mirrored = tree(&scene(glass, &lights(1.0), &(mirror + &geometry(1.0))), side() / 2);
+        let straight = tree(&scene(glass, &lights(-1.0), &geometry(-1.0)), side() / 2);
+        assert!(straight.iter().filter(|pixel| **pixel != [0.0; 3]).count() > 1000);
+        for (k, (m, s)) in mirrored.iter().zip(&straight).enumerate() {
             let is_same = m.iter().zip(s).all(|(m, s)| (m - s).abs() <= 1e-6 * s.max(1.0));
             assert!(is_same, "{seed}: pixel {k} is {m:?}, not {s:?}");
         }
@@ -140,7 +118,7 @@ fn a_white_world_stays_white_whatever_mirrors_and_bends() {
             + &sphere(DVec3::new(0.0, 0.0, 5.0), 0.7, "c");
         let mut scene = scene(&materials, "ambient 1", &geometry);
         scene.background = DVec3::ONE;
-        for pixel in rendered(&scene, 100).pixels {
+        for pixel in tree(&scene, 100) {
             assert!((f64::from(pixel[0]) - 1.0).abs() < 1e-6, "{seed}: {pixel:?}");
         }
     }
@@ -637,24 +615,21 @@ fn light_that_never_gets_out_adds_up_a_geometric_series_and_no_more() {
             // Straight ahead is along the skin.
             let center = eye + DVec3::new(random.sign() * 0.98, random.between(-0.01, 0.01), 0.0);
             let glass = format!("entry name glass alpha {alpha:?} refract 0.6666667 endentry");
-            let tile = rendered(
-                &scene(&glass, "ambient 1", &sphere(center, 1.0, "glass")),
-                side_of(2_500),
-            );
+            let seen =
+                tree(&scene(&glass, "ambient 1", &sphere(center, 1.0, "glass")), side_of(2_500));
             let mut rest = 1.0 - alpha;
             for _ in 0..64 {
                 if rest >= 1.0 / 4096.0 {
                     rest *= 1.0 - alpha;
                 }
             }
-            assert!(tile.tally.cut <= 1.0 + 1e-12);
-            let kept = tile.pixels.iter().map(|pixel| f64::from(pixel[0]));
+            let kept = seen.iter().map(|pixel| f64::from(pixel[0]));
             // Rays aside of that plane may get out, and then show no more of the ball.
             let most = kept.fold(0.0, f64::max);
             assert!(most <= 1.0 - rest + 1e-6, "{alpha}: {most}, at most {}", 1.0 - rest);
-            let middle = tile.pixels[tile.pixels.len() / 2 + side_of(2_500) as usize / 2];
+            let middle = seen[seen.len() / 2 + side_of(2_500) as usize / 2];
             worst = worst.max((f64::from(middle[0]) - (1.0 - rest)).abs());
-            count += tile.pixels.len();
+            count += seen.len();
         }
     }
     HardCase::TotalReflection.tell(
@@ -670,7 +645,7 @@ fn check_grazed(what: &str, scene: &Scene, side: u64) -> u64 {
     let below = tile.pixels.iter().filter(|pixel| **pixel != [0.0, 0.0, 1.0]).count();
     assert_eq!(below, 0, "{what}: rays that go below");
     assert_eq!(
-        (tile.tally.rays, tile.tally.cut),
+        (tile.tally.rays, tile.tally.untraced),
         (2 * side * side, 0.0),
         "{what}: rays that meet it again"
     );
@@ -757,7 +732,7 @@ fn difference_from_oracle(scene: &Scene, side: u64) -> usize {
     let is_same = |found: [f32; 3], truth: [f64; 3]| {
         found.iter().zip(truth).all(|(f, t)| (f64::from(*f) - t).abs() <= 1e-6 * t.max(1.0))
     };
-    let found = picture(scene, &settings);
+    let found = tree_picture(scene, &settings);
     found.into_iter().zip(truth).filter(|&(found, truth)| !is_same(found, truth)).count()
 }
 

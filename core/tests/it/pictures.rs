@@ -22,7 +22,9 @@ use rtfarm_oracle::{
     reference_picture,
 };
 
-use crate::support::studio::{picture, pixels, prepared, quality, read, settings, whole};
+use crate::support::studio::{
+    picture, pixels, prepared, quality, read, settings, tree_picture, whole,
+};
 
 /// The channels are rounded to f32 once, at the end; 1.0 is what a scene writes as 255.
 const ROUNDING: f64 = 1e-6;
@@ -57,7 +59,7 @@ fn pixel_margin(oracle: &Oracle, scene: &Scene, settings: &Settings, x: u32, y: 
 /// The tracer's picture is the oracle's, but for pixels with a sample so close to an edge that
 /// rounding decides; tells how many there are.
 fn check_against_oracle(what: &str, scene: &Scene, settings: &Settings) -> usize {
-    let found = picture(scene, settings);
+    let found = tree_picture(scene, settings);
     let oracle_settings =
         OracleSettings { flat: settings.quality.flat, ..OracleSettings::default() };
     let of_pixel = |x, y| positions(settings, x, y);
@@ -119,7 +121,7 @@ fn random_mirrors_and_glass_look_as_the_oracle_sees_them() {
             let recipe = Recipe { solids: 2, clear: true, ..Recipe::new(style) };
             let scene = random_scene(seed, &recipe);
             let settings = settings(24, 18, 1);
-            let found = picture(&scene, &settings);
+            let found = tree_picture(&scene, &settings);
             let of_pixel = |x, y| positions(&settings, x, y);
             let truth =
                 reference_picture(&scene, settings.size, &of_pixel, &OracleSettings::default());

@@ -7,8 +7,10 @@ use glam::DVec3;
 use rayon::prelude::*;
 use rtfarm_core::{
     isa::Isa,
-    render::{Cutoff, Quality, RenderedTile, Sampling, Settings, render_tile},
+    prepared::PreparedScene,
+    render::{Quality, RenderedTile, Sampling, Settings, render_tile},
     scene::{Scene, Texture},
+    testing::render_trees,
     tile::{Area, Size},
 };
 use rtfarm_oracle::{
@@ -66,14 +68,7 @@ fn polygon(corners: &[DVec3], material: &str) -> String {
 
 fn settings(side: u64, samples: u32, secondary: bool) -> Settings {
     let sampling = Sampling::fixed(samples).unwrap();
-    // With a cut-off of 1 nothing is seen in mirrors.
-    let quality = Quality {
-        sampling,
-        seed: 5,
-        secondary,
-        cutoff: Cutoff::new(1.0).unwrap(),
-        ..Quality::default()
-    };
+    let quality = Quality { sampling, seed: 5, secondary, ..Quality::default() };
     Settings { size: Size::new(side, side).unwrap(), quality }
 }
 
@@ -107,8 +102,11 @@ fn gathered(
         geometry {geometry} endgeometry",
         viewport(point, normal)
     ));
-    let with = rendered(&scene, &settings(SIDE, 1024, true), Isa::fastest()).pixels;
-    let without = rendered(&scene, &settings(SIDE, 1024, false), Isa::fastest()).pixels;
+    let [with, without] = [true, false].map(|secondary| {
+        let Settings { size, quality } = settings(SIDE, 1024, secondary);
+        // With a cut-off of 1 nothing is seen in mirrors.
+        render_trees(&prepared(&scene), &quality, whole(size), Isa::fastest(), 1.0).pixels
+    });
     let difference = |(with, without): (&[f32; 3], &[f32; 3])| {
         (f64::from(with[0]) - f64::from(without[0])) / shows
     };
@@ -392,38 +390,31 @@ fn medley(seed: u64) -> Scene {
     ))
 }
 
-/// Settings under which a pixel's one sample is its middle, and nothing is seen in mirrors of
-/// mirrors.
-fn middles(size: Size, seed: u64, secondary: bool) -> Settings {
+/// With this cut-off nothing is seen in mirrors of mirrors.
+const CUTOFF: f64 = 0.1;
+
+/// A picture of which a pixel's one sample is its middle.
+fn middles<B: AsRef<[u8]>>(
+    block: &PreparedScene<B>,
+    size: Size,
+    seed: u64,
+    secondary: bool,
+) -> Vec<[f32; 3]> {
     let sampling = Sampling::fixed(1).unwrap();
-    let quality = Quality {
-        sampling,
-        seed,
-        secondary,
-        cutoff: Cutoff::new(0.1).unwrap(),
-        ..Quality::default()
-    };
-    Settings { size, quality }
+    let quality = Quality { sampling, seed, secondary, ..Quality::default() };
+    render_trees(block, &quality, whole(size), Isa::fastest(), CUTOFF).pixels
 }
 
 fn oracle_settings(secondary: Option<u32>) -> OracleSettings {
-    OracleSettings { cutoff: 0.1, secondary, ..OracleSettings::default() }
+    OracleSettings { cutoff: CUTOFF, secondary, ..OracleSettings::default() }
 }
 
 /// The mean of a picture over many seeds is what the oracle sums, within 4 sigma and the error of
 /// that sum, which a coarser one tells. Both are small shares of the light that is sent on.
 fn check_against_oracle(what: &str, scene: &Scene, size: Size, side: u32, seeds: u64) {
     let block = prepared(scene);
-    let pictures: Vec<Vec<[f32; 3]>> = (0..seeds)
-        .into_par_iter()
-        .map(|seed| {
-            let go_on = &mut || ControlFlow::Continue(());
-            let settings = middles(size, seed, true);
-            render_tile(&block, &settings.quality, whole(size), Isa::fastest(), go_on)
-                .unwrap()
-                .pixels
-        })
-        .collect();
+    let pictures: Vec<Vec<[f32; 3]>> =
+        (0..seeds).into_par_iter().map(|seed| middles(&block, size, seed, true)).collect();
     let middle = |_, _| vec![(0.5, 0.5)];
     let summed = |secondary| {
         let settings = oracle_settings(secondary);
@@ -514,7 +505,7 @@ fn without_it_the_picture_is_the_oracles_in_light_from_lamps_alone() {
     let size = Size::new(32, 18).unwrap();
     for seed in [1, 2, 3] {
         let scene = medley(seed);
-        let found = rendered(&scene, &middles(size, 7, false), Isa::fastest()).pixels;
+        let found = middles(&prepared(&scene), size, 7, false);
         let middle = |_, _| vec![(0.5, 0.5)];
         let truth = reference_picture(&scene, size, &middle, &oracle_settings(None));
         let oracle = Oracle::new(&scene);

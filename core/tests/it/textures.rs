@@ -23,7 +23,9 @@ use rtfarm_oracle::{
     reference_picture,
 };
 
-use crate::support::studio::{self, picture, pixels, prepared, quality, settings, whole};
+use crate::support::studio::{
+    self, picture, pixels, prepared, quality, settings, tree_picture, whole,
+};
 
 const TEXELS: [[u8; 3]; 6] =
     [[255, 0, 0], [0, 255, 0], [0, 0, 255], [1, 2, 3], [128, 64, 32], [250, 251, 252]];
@@ -478,7 +480,7 @@ fn random_textured_scenes_look_as_the_oracle_sees_them() {
     for seed in 300..306 {
         let scene = random_textured_scene(seed, (3, 2), 1.0);
         let settings = Settings { quality: quality(1, 3), ..settings(48, 36, 1) };
-        let found = picture(&scene, &settings);
+        let found = tree_picture(&scene, &settings);
         let of_pixel =
             |x, y| vec![Samples::new(1, settings.quality.seed, x, y).sample(0).position().into()];
         let truth = reference_picture(&scene, settings.size, &of_pixel, &OracleSettings::default());

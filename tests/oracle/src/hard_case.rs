@@ -141,6 +141,8 @@ pub enum HardCase {
     AnyMachine = 65,
     /// Coincident faces of different materials.
     CoincidentFaces = 66,
+    /// An eye inside glass that mirrors too.
+    InsideMirroringGlass = 67,
     /// A solid far smaller than its scene.
     TinySolid = 69,
     /// A label on a tilted quadrangle, coplanar only within rounding.

@@ -14,7 +14,8 @@ use crate::{
 pub struct Settings {
     /// Every surface shows its plain colour, as in a scene without light.
     pub flat: bool,
-    /// A branch whose weight is below this is not traced.
+    /// A branch whose weight is below this counts as background, or sums would never end. At 0 the
+    /// radiance is the one that the format defines.
     pub cutoff: f64,
     /// Faces send light on to others, which is summed over this many times this many directions;
     /// see [`Oracle::secondary_light`]. `None`: they do not.
@@ -74,20 +75,23 @@ impl Oracle {
         let (reflect, alpha) = (material.reflect, material.alpha);
 
         let mut radiance = DVec3::ZERO;
-        if reflect > 0.0 {
-            radiance += reflect * follow(mirrored, false, reflect);
+        let (mut mirrored_factor, mut transmitted_factor) =
+            (reflect, (1.0 - reflect) * (1.0 - alpha));
+        let bent = transmitted_direction(direction, &hit, material);
+        if bent.is_none() {
+            mirrored_factor += std::mem::take(&mut transmitted_factor);
+        }
+        if mirrored_factor > 0.0 {
+            radiance += mirrored_factor * follow(mirrored, false, mirrored_factor);
         }
         if reflect < 1.0 && alpha > 0.0 {
             let surface = self.surface_color(&hit) * self.irradiance(&crossing, &hit, settings);
             radiance += (1.0 - reflect) * alpha * surface;
         }
-        if reflect < 1.0 && alpha < 1.0 {
-            let factor = (1.0 - reflect) * (1.0 - alpha);
-            let transmitted = match transmitted_direction(direction, &hit, material) {
-                Some(bent) => follow(bent, true, factor),
-                None => follow(mirrored, false, factor),
-            };
-            radiance += factor * transmitted;
+        if let Some(bent) = bent
+            && transmitted_factor > 0.0
+        {
+            radiance += transmitted_factor * follow(bent, true, transmitted_factor);
         }
         radiance
     }

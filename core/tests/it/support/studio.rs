@@ -9,8 +9,10 @@ use rtfarm_core::{
     prepared::{PreparedBytes, PreparedScene},
     render::{Quality, Sampling, Settings, render_tile},
     scene::Scene,
+    testing::render_trees,
     tile::{Area, Size},
 };
+use rtfarm_oracle::Settings as OracleSettings;
 
 /// The scene of a text without a fault.
 pub(crate) fn read(text: &str) -> Scene {
@@ -53,6 +55,12 @@ pub(crate) fn pixels(
         assert!(pixel.iter().all(|c| c.is_finite() && *c >= 0.0), "pixel {k}: {pixel:?}");
     }
     pixels
+}
+
+/// The whole picture, row by row, without roulette, cut off where the oracle cuts off.
+pub(crate) fn tree_picture(scene: &Scene, settings: &Settings) -> Vec<[f32; 3]> {
+    let (area, cutoff) = (whole(settings.size), OracleSettings::default().cutoff);
+    render_trees(&prepared(scene), &settings.quality, area, Isa::fastest(), cutoff).pixels
 }
 
 /// The whole picture, row by row.
