@@ -86,7 +86,6 @@ pub(crate) async fn connect(address: &Address) -> anyhow::Result<JobsClient<Chan
     client.with_context(|| format!("no coordinator answers at {address}"))
 }
 
-#[expect(clippy::needless_pass_by_value, reason = "`map_err` hands it over")]
 pub(crate) fn late(_: tokio::time::error::Elapsed) -> anyhow::Error {
     anyhow!("the coordinator does not answer")
 }

@@ -399,7 +399,7 @@ impl Submission {
     fn give_up(&mut self, failure: Failure, now: Instant) {
         match self.stage {
             Stage::Connecting | Stage::Submitting | Stage::Reconnecting { job: None, .. } => {
-                self.end(Err(failure))
+                self.end(Err(failure));
             }
             Stage::Watching { job, .. }
             | Stage::Fetching { job, .. }

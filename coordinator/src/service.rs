@@ -250,7 +250,7 @@ impl jobs_server::Jobs for JobsService {
             Received::Known(job) => return Ok(Response::new(accepted(&job, &self.shell))),
             Received::New(bundle) => bundle,
         };
-        let Bundle { order, text, files } = bundle;
+        let Bundle { order, text, files } = *bundle;
         let ticket = to_ticket(&order);
         let wanted = to_request(order).map_err(invalid)?;
         let shell = Arc::clone(&self.shell);
@@ -505,7 +505,7 @@ struct Bundle {
 
 /// What a client sent.
 enum Received {
-    New(Bundle),
+    New(Box<Bundle>),
     /// An order whose job is there already.
     Known(Arc<Job>),
 }
@@ -542,7 +542,7 @@ async fn receive(parts: Streaming<wire::SubmitRequest>, shell: &Shell) -> Result
             return Err(Status::resource_exhausted("the scene and its files are too long"));
         }
     }
-    Ok(Received::New(Bundle { order, text, files }))
+    Ok(Received::New(Box::new(Bundle { order, text, files })))
 }
 
 /// What a client sends, piece by piece.

@@ -817,7 +817,7 @@ fn log(notice: Notice) {
             tracing::warn!(count, "calls meant for another start of a coordinator were refused");
         }
         Notice::JobExpired(job) => {
-            tracing::info!(job = job.0, "job forgotten: it was kept long enough")
+            tracing::info!(job = job.0, "job forgotten: it was kept long enough");
         }
         Notice::JobChanged(job, change) => tracing::info!(job = job.0, ?change, "job changed"),
         Notice::Stationed(worker, standing) => {

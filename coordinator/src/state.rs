@@ -242,7 +242,7 @@ impl StateFolder {
         let ticket = record.ticket();
         let (is_paused, is_foreign) = (record.is_paused, record.build != self.build);
         // The record is written last at its end.
-        let age = || Some(fs::metadata(path.join(JOB)).ok()?.modified().ok()?.elapsed().ok()?);
+        let age = || fs::metadata(path.join(JOB)).ok()?.modified().ok()?.elapsed().ok();
         let end = end.map(|end| (end, age().unwrap_or_default()));
         Ok(KeptJob { id, ticket, is_paused, is_foreign, plan, scene, canvas, done, end, folder })
     }
