@@ -2,7 +2,10 @@
 
 use std::{fmt, ops::RangeInclusive, path::PathBuf, str::FromStr, time::Duration};
 
-use clap::{Args as ClapArgs, Parser, Subcommand, ValueEnum, value_parser};
+use clap::{
+    Args as ClapArgs, Parser, Subcommand, ValueEnum, builder::NonEmptyStringValueParser,
+    value_parser,
+};
 use rtfarm_core::{
     isa::{Isa, IsaError},
     render::{Quality, SampleCount, SampleLimit, Sampling, StandardError},
@@ -34,8 +37,30 @@ pub(crate) enum Command {
     Worker(WorkerArgs),
     /// Have a farm render a scene.
     Submit(SubmitArgs),
-    /// Fetch the picture of a finished job that a farm still keeps.
+    /// List a farm's jobs, those that are rendered first in the order in which they are.
+    Jobs(FarmArgs),
+    /// List a farm's workers.
+    Workers(FarmArgs),
+    /// Follow a job to its end; exits with 1 when it fails.
+    Watch(JobArgs),
+    /// Fetch the picture of a finished job, which the farm then forgets.
     Image(ImageArgs),
+    /// End a job and forget it.
+    Cancel(JobArgs),
+    /// Give workers no more tiles of a job; those in work are taken.
+    Pause(JobArgs),
+    /// Go on with a job that was paused.
+    Resume(JobArgs),
+    /// Put a job before those of a lower priority.
+    Priority(PriorityArgs),
+    /// Render what a failed job lacks.
+    Retry(JobArgs),
+    /// Have a worker finish the tiles that it has, and go home.
+    Drain(StationArgs),
+    /// Have a worker finish the tiles that it has, and give it no more.
+    Disable(StationArgs),
+    /// Give tiles again to a worker that was disabled or is drained.
+    Enable(StationArgs),
     /// Say what is wrong with a scene, and what it needs.
     Check(CheckArgs),
     /// Measure speed against error of a scene, whose picture at many samples stands for the truth.
@@ -227,6 +252,14 @@ pub(crate) struct CoordinatorArgs {
     #[arg(long, value_name = "S", default_value = "4", value_parser = parse_seconds)]
     pub(crate) lease_seconds: Duration,
 
+    /// How long a job that has ended is kept if nobody fetches its picture.
+    #[arg(long, value_name = "HOURS", default_value = "168", value_parser = value_parser!(u32).range(1..=87_600))]
+    pub(crate) keep_hours: u32,
+
+    /// The most bytes, in GB, that jobs that have ended are kept in; the oldest go first.
+    #[arg(long, value_name = "GB", default_value = "16", value_parser = value_parser!(u32).range(1..))]
+    pub(crate) keep_gb: u32,
+
     /// How much of what a worker renders another renders again, to find out who lies, from 0 to 1;
     /// besides, each worker's first tile of a picture. 0 compares nothing.
     #[arg(long, value_name = "FRACTION", default_value = "0.01", value_parser = parse_fraction)]
@@ -281,7 +314,36 @@ pub(crate) struct SubmitArgs {
     #[arg(long, value_name = "URL")]
     pub(crate) coordinator: Address,
 
-    /// How long to go on without a coordinator once it has the job.
+    /// Print the job's number and end: the job goes on by itself, and `rtfarm image` fetches what -o
+    /// says. Otherwise an interruption cancels it.
+    #[arg(long)]
+    pub(crate) detach: bool,
+
+    /// What the job is called; the scene's file by default.
+    #[arg(long, value_name = "NAME")]
+    pub(crate) name: Option<String>,
+
+    /// Who wants it; the user's login name by default.
+    #[arg(long, value_name = "OWNER")]
+    pub(crate) owner: Option<String>,
+
+    /// Submit only once under this key: a job that has it already is taken for this one.
+    #[arg(long, value_name = "KEY", value_parser = NonEmptyStringValueParser::new())]
+    pub(crate) key: Option<String>,
+
+    /// Jobs of a higher priority come first.
+    #[arg(long, value_name = "N", default_value_t = 0, allow_negative_numbers = true)]
+    pub(crate) priority: i32,
+
+    /// The most workers that render it at the same time.
+    #[arg(long, value_name = "N", value_parser = value_parser!(u32).range(1..))]
+    pub(crate) max_workers: Option<u32>,
+
+    /// Answer in JSON.
+    #[arg(long)]
+    pub(crate) json: bool,
+
+    /// How long to go on without a coordinator once it was reached.
     #[arg(long, value_name = "S", default_value = "60", value_parser = parse_seconds)]
     pub(crate) patience: Duration,
 
@@ -290,11 +352,65 @@ pub(crate) struct SubmitArgs {
     pub(crate) log_format: LogFormat,
 }
 
+/// Which farm is asked, and how it is told.
+#[derive(Debug, ClapArgs)]
+pub(crate) struct FarmArgs {
+    /// Where the coordinator is: `http://host:7878` or `unix:/path/socket`.
+    #[arg(long, value_name = "URL")]
+    pub(crate) coordinator: Address,
+
+    /// Answer in JSON.
+    #[arg(long)]
+    pub(crate) json: bool,
+}
+
+#[derive(Debug, ClapArgs)]
+pub(crate) struct JobArgs {
+    /// The job's number.
+    #[arg(value_name = "JOB")]
+    pub(crate) job: u64,
+
+    #[command(flatten)]
+    pub(crate) farm: FarmArgs,
+}
+
+#[derive(Debug, ClapArgs)]
+pub(crate) struct PriorityArgs {
+    #[command(flatten)]
+    pub(crate) job: JobArgs,
+
+    /// 0 is that of a job of which nothing is said.
+    #[arg(value_name = "N", allow_negative_numbers = true)]
+    pub(crate) priority: i32,
+}
+
+#[derive(Debug, ClapArgs)]
+pub(crate) struct StationArgs {
+    /// The worker's number, as `rtfarm workers` lists it.
+    #[arg(value_name = "WORKER")]
+    pub(crate) worker: u32,
+
+    #[command(flatten)]
+    pub(crate) farm: FarmArgs,
+}
+
 #[derive(Debug, ClapArgs)]
 pub(crate) struct ImageArgs {
     /// The job's number.
     #[arg(value_name = "JOB")]
     pub(crate) job: u64,
+
+    /// Fetch what there is of a job that has not finished; what there is not is black.
+    #[arg(long)]
+    pub(crate) partial: bool,
+
+    /// Have the farm keep the picture.
+    #[arg(long)]
+    pub(crate) keep: bool,
+
+    /// Answer in JSON.
+    #[arg(long)]
+    pub(crate) json: bool,
 
     /// Where the picture goes; the extension should be that of the file that was asked for.
     #[arg(short, long, value_name = "FILE")]
@@ -405,7 +521,7 @@ impl Command {
             Self::Coordinator(args) => args.log_format,
             Self::Worker(args) => args.log_format,
             Self::Submit(args) => args.log_format,
-            Self::Check(_) | Self::Image(_) | Self::Report(_) => LogFormat::Text,
+            _ => LogFormat::Text,
         }
     }
 }

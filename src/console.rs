@@ -47,9 +47,10 @@ impl Console {
     /// `RUST_LOG` chooses others.
     pub(crate) fn new(command: &Command) -> Self {
         let format = command.log_format();
-        let has_bar = matches!(command, Command::Render(_) | Command::Submit(_))
-            && format == LogFormat::Text
-            && io::stderr().is_terminal();
+        let has_bar =
+            matches!(command, Command::Render(_) | Command::Submit(_) | Command::Watch(_))
+                && format == LogFormat::Text
+                && io::stderr().is_terminal();
         let is_local_worker = matches!(command, Command::Worker(args) if args.parent.is_some());
         let level = if has_bar || is_local_worker { LevelFilter::WARN } else { LevelFilter::INFO };
         let bar = Arc::<Mutex<Option<ProgressBar>>>::default();

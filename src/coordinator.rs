@@ -8,7 +8,9 @@ use std::{
 };
 
 use anyhow::{Context, anyhow};
-use rtfarm_coordinator::{Config, Coordinator, Durability, Listener, StateError, StateFolder};
+use rtfarm_coordinator::{
+    Config, Coordinator, Durability, Keeping, Listener, StateError, StateFolder,
+};
 use rtfarm_core::isa::Isa;
 use tokio::{net::lookup_host, task::spawn_blocking};
 use tokio_util::sync::CancellationToken;
@@ -54,6 +56,10 @@ pub(crate) async fn run(
         reference: Some(rtfarm_worker::reference(Isa::fastest())),
         term: args.lease_seconds,
         audit: args.audit,
+        keeping: Keeping {
+            time: Duration::from_secs(u64::from(args.keep_hours) * 3600),
+            byte_count: u64::from(args.keep_gb) * 1_000_000_000,
+        },
         upload_silence: UPLOAD_SILENCE,
         scene_folder: folder.clone(),
         picture_folder: folder,

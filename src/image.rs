@@ -1,23 +1,21 @@
-//! `rtfarm image`: the picture of a finished job that a farm still keeps.
+//! `rtfarm image`: the picture of a job that a farm still keeps, or what there is of it.
 
 use std::time::Duration;
 
-use anyhow::{Context, anyhow};
 use rtfarm_proto::wire;
 use tokio::{sync::mpsc, task::spawn_blocking, time::timeout};
 use tokio_util::sync::CancellationToken;
-use tonic::Status;
 
 use crate::{
     args::ImageArgs,
     failure::Failure,
     output::Output,
-    plain::plain,
-    submit::{reach, write_chunks},
+    queue::{connect, late, picture_json, refused, tell},
+    submit::write_chunks,
 };
 
-/// The longest that reaching the coordinator may take.
-const DEADLINE: Duration = Duration::from_secs(15);
+/// A coordinator that listens forgets a job at once.
+const FORGET_DEADLINE: Duration = Duration::from_secs(3);
 
 /// Encoding a large picture takes a while.
 const IMAGE_DEADLINE: Duration = Duration::from_secs(600);
@@ -40,17 +38,34 @@ pub(crate) async fn run(args: ImageArgs, stop: &CancellationToken) -> Result<(),
     // The file is whole or removed when this process ends.
     let written = writing.await?;
     fetched?;
-    Ok(written?)
+    written?;
+    if !args.partial && !args.keep {
+        forget(&args).await;
+    }
+    if args.json {
+        tell(true, &picture_json(args.job, output.name(), None), "")?;
+    }
+    Ok(())
+}
+
+/// Has the farm forget a job whose picture is here. If it does not it will keep it for a while.
+async fn forget(args: &ImageArgs) {
+    let request = wire::CancelRequest { job: args.job, ..wire::CancelRequest::default() };
+    let cancel = async { connect(&args.coordinator).await?.cancel(request).await.map_err(refused) };
+    let forgotten = match timeout(FORGET_DEADLINE, cancel).await {
+        Ok(forgotten) => forgotten.map(drop),
+        Err(elapsed) => Err(late(elapsed)),
+    };
+    if let Err(error) = forgotten {
+        tracing::warn!(reason = %error, "the farm still keeps the picture");
+    }
 }
 
 /// Brings the picture and hands it on, piece by piece; the last one is empty.
 async fn fetch(args: &ImageArgs, send: mpsc::Sender<wire::Chunk>) -> Result<(), Failure> {
-    let address = &args.coordinator;
-    let late = |_| anyhow!("the coordinator does not answer");
-    let refused = |status: Status| anyhow!("the coordinator says: {}", plain(status.message()));
-    let client = timeout(DEADLINE, reach(address)).await.map_err(late)?;
-    let mut client = client.with_context(|| format!("no coordinator answers at {address}"))?;
-    let image = client.image(wire::ImageRequest { job: args.job, ..wire::ImageRequest::default() });
+    let mut client = connect(&args.coordinator).await?;
+    let ImageArgs { job, partial, .. } = *args;
+    let image = client.image(wire::ImageRequest { job, partial, ..wire::ImageRequest::default() });
     let image = timeout(IMAGE_DEADLINE, image).await.map_err(late)?;
     let mut chunks = image.map_err(refused)?.into_inner();
     loop {

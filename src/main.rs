@@ -13,6 +13,7 @@ mod output;
 mod pilot;
 mod plain;
 mod private_folder;
+mod queue;
 mod render;
 mod report;
 mod resume;
@@ -25,13 +26,15 @@ mod worker;
 use std::process::ExitCode;
 
 use clap::Parser;
+use rtfarm_proto::wire::{Nothing, Standing, control_request::Change};
 use tokio::signal::unix::{SignalKind, signal};
 use tokio_util::sync::CancellationToken;
 
 use crate::{
-    args::{Args, Command},
+    args::{Args, Command, JobArgs, PriorityArgs, StationArgs},
     console::Console,
     failure::Failure,
+    queue::Wish,
 };
 
 /// The version that both ends of a farm must have.
@@ -76,6 +79,31 @@ async fn run(command: Command, console: &Console) -> Result<(), Failure> {
         Command::Worker(args) => worker::run(args, &stop, &terminate).await,
         Command::Submit(args) => submit::run(args, console, &stop).await,
         Command::Image(args) => image::run(args, &stop).await,
+        Command::Watch(args) => queue::watch(args, console, &stop).await,
+        Command::Jobs(args) => queue::run(args, Wish::Jobs, &stop).await,
+        Command::Workers(args) => queue::run(args, Wish::Workers, &stop).await,
+        Command::Cancel(args) => queue::run(args.farm, Wish::Cancel(args.job), &stop).await,
+        Command::Pause(JobArgs { job, farm }) => {
+            queue::run(farm, Wish::Change(job, Change::Paused(true)), &stop).await
+        }
+        Command::Resume(JobArgs { job, farm }) => {
+            queue::run(farm, Wish::Change(job, Change::Paused(false)), &stop).await
+        }
+        Command::Priority(PriorityArgs { job: JobArgs { job, farm }, priority }) => {
+            queue::run(farm, Wish::Change(job, Change::Priority(priority)), &stop).await
+        }
+        Command::Retry(JobArgs { job, farm }) => {
+            queue::run(farm, Wish::Change(job, Change::Retry(Nothing {})), &stop).await
+        }
+        Command::Drain(StationArgs { worker, farm }) => {
+            queue::run(farm, Wish::Station(worker, Standing::Draining), &stop).await
+        }
+        Command::Disable(StationArgs { worker, farm }) => {
+            queue::run(farm, Wish::Station(worker, Standing::Disabled), &stop).await
+        }
+        Command::Enable(StationArgs { worker, farm }) => {
+            queue::run(farm, Wish::Station(worker, Standing::Active), &stop).await
+        }
         Command::Report(args) => report::run(args, console, &stop).await,
         Command::Check(args) => check::run(args, console, &stop).await,
     }

@@ -7,7 +7,7 @@ use std::{
 };
 
 use anyhow::{Context, anyhow};
-use rtfarm_coordinator::{Config, Coordinator, Job, Listener};
+use rtfarm_coordinator::{Config, Coordinator, Job, Keeping, Listener};
 use rtfarm_core::{
     language::draw_diagnostics,
     render::{DEEPEST, Sampling, Tally},
@@ -266,6 +266,7 @@ async fn render_with_workers(
         reference: None,
         term: args.lease_seconds,
         audit: 0.0,
+        keeping: Keeping::default(),
         upload_silence: UPLOAD_SILENCE,
         scene_folder: folder.path().to_owned(),
         picture_folder: output.folder(),

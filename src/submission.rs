@@ -1,5 +1,5 @@
 //! A client's side of one job: it submits a scene, watches the job, fetches the picture and has
-//! the farm forget the job. Decisions alone: what happens comes in as events with the time, what
+//! the farm forget the job; a detached one ends when it knows its job. Decisions alone: what happens comes in as events with the time, what
 //! is to be done goes out as [`Action`]s, and nothing here waits.
 
 use std::{
@@ -35,7 +35,7 @@ pub(crate) enum Action {
     /// Have the farm forget the job.
     Cancel(JobId),
     /// End; nothing comes after this.
-    End(Result<Finished, Failure>),
+    End(Result<Ended, Failure>),
 }
 
 /// What came of submitting a scene.
@@ -84,6 +84,15 @@ pub(crate) struct Finished {
     pub(crate) tally: Tally,
     pub(crate) worker_count: u32,
     pub(crate) rendering: Duration,
+}
+
+/// What a submission came to.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) enum Ended {
+    /// The job's picture was written.
+    Finished(JobId, Finished),
+    /// The job goes on by itself.
+    Detached(JobId, Size),
 }
 
 /// What goes wrong on the way.
@@ -150,8 +159,10 @@ pub(crate) struct Submission {
     /// What the scene is called in messages.
     scene: String,
     coordinator: Address,
-    /// How long a coordinator that has the job may be gone.
+    /// How long a coordinator that was reached may be gone.
     patience: Duration,
+    /// The job outlives this client.
+    is_detached: bool,
     /// When it was last heard of, if it is gone.
     gone_since: Option<Instant>,
     pause: Duration,
@@ -173,15 +184,14 @@ enum Stage {
         job: JobId,
         finished: Finished,
     },
-    /// The coordinator was gone and is looked for, after a pause.
+    /// The coordinator was gone and is looked for, after a pause. It may have the job.
     Reconnecting {
-        job: JobId,
-        size: Size,
+        job: Option<(JobId, Size)>,
         is_pausing: bool,
     },
     /// The job is being forgotten; then the submission ends so.
     Cancelling {
-        end: Result<Finished, Failure>,
+        end: Result<Ended, Failure>,
     },
     Ended,
 }
@@ -192,12 +202,14 @@ impl Submission {
         scene: String,
         coordinator: Address,
         patience: Duration,
+        is_detached: bool,
         now: Instant,
     ) -> Self {
         let mut submission = Self {
             scene,
             coordinator,
             patience,
+            is_detached,
             gone_since: None,
             pause: FIRST_PAUSE,
             stage: Stage::Ended,
@@ -221,10 +233,11 @@ impl Submission {
     /// Event: the coordinator was reached.
     pub(crate) fn on_connected(&mut self, now: Instant) {
         match self.stage {
-            Stage::Connecting => {
+            // The order has a key: a coordinator that has the job already answers with it.
+            Stage::Connecting | Stage::Reconnecting { job: None, .. } => {
                 self.enter(Stage::Submitting, Action::Submit, now + SUBMIT_DEADLINE);
             }
-            Stage::Reconnecting { job, size, .. } => {
+            Stage::Reconnecting { job: Some((job, size)), .. } => {
                 self.enter(Stage::Watching { job, size }, Action::Watch(job), now + DEADLINE);
             }
             _ => {}
@@ -235,7 +248,11 @@ impl Submission {
     pub(crate) fn on_submitted(&mut self, submitted: Submitted, now: Instant) {
         let Stage::Submitting = self.stage else { return };
         self.actions.push_back(Action::TellReport(submitted.report));
+        (self.gone_since, self.pause) = (None, FIRST_PAUSE);
         match submitted.outcome {
+            SubmitOutcome::Accepted { job, size } if self.is_detached => {
+                self.end(Ok(Ended::Detached(job, size)));
+            }
             SubmitOutcome::Accepted { job, size } => {
                 self.enter(Stage::Watching { job, size }, Action::Watch(job), now + DEADLINE);
             }
@@ -296,7 +313,7 @@ impl Submission {
     /// Event: the whole picture was written.
     pub(crate) fn on_fetched(&mut self, now: Instant) {
         if let Stage::Fetching { job, finished } = &self.stage {
-            self.cancel(*job, Ok(finished.clone()), now);
+            self.cancel(*job, Ok(Ended::Finished(*job, finished.clone())), now);
         }
     }
 
@@ -319,19 +336,23 @@ impl Submission {
                      --coordinator {coordinator} -o FILE fetches it"
                 ))));
             }
-            (&Stage::Watching { job, size } | &Stage::Reconnecting { job, size, .. }, trouble) => {
-                self.find_again((job, size), trouble, now);
+            (&Stage::Watching { job, size }, trouble) => {
+                self.find_again(Some((job, size)), trouble, now);
             }
+            (&Stage::Reconnecting { job, .. }, trouble) => self.find_again(job, trouble, now),
             (Stage::Fetching { job, finished }, trouble) => {
-                self.find_again((*job, finished.size), trouble, now);
+                self.find_again(Some((*job, finished.size)), trouble, now);
+            }
+            (Stage::Submitting, trouble @ (Trouble::Lost(_) | Trouble::Gone)) => {
+                self.find_again(None, trouble, now);
             }
             (_, trouble) => self.give_up(Failure::Other(anyhow::Error::msg(trouble)), now),
         }
     }
 
-    /// Looks for a coordinator that has a job and is gone, unless it was gone for too long. One that
-    /// keeps its jobs will have it.
-    fn find_again(&mut self, (job, size): (JobId, Size), trouble: Trouble, now: Instant) {
+    /// Looks for a coordinator that is gone and may have the job, unless it was gone for too long. One
+    /// that keeps its jobs will have it.
+    fn find_again(&mut self, job: Option<(JobId, Size)>, trouble: Trouble, now: Instant) {
         let may_be_gone = matches!(
             trouble,
             Trouble::Connect(..) | Trouble::Lost(_) | Trouble::Late | Trouble::Gone
@@ -342,7 +363,7 @@ impl Submission {
             return self.give_up(Failure::Other(anyhow::Error::msg(trouble)), now);
         }
         self.pause = LONGEST_PAUSE.min(self.pause * 2);
-        self.stage = Stage::Reconnecting { job, size, is_pausing: true };
+        self.stage = Stage::Reconnecting { job, is_pausing: true };
         self.deadline = Some(again_at);
     }
 
@@ -351,8 +372,8 @@ impl Submission {
         if self.deadline.is_none_or(|deadline| now < deadline) {
             return;
         }
-        if let Stage::Reconnecting { job, size, is_pausing: true } = self.stage {
-            let reconnecting = Stage::Reconnecting { job, size, is_pausing: false };
+        if let Stage::Reconnecting { job, is_pausing: true } = self.stage {
+            let reconnecting = Stage::Reconnecting { job, is_pausing: false };
             let patient_until = self.gone_since.map_or(now, |since| since + self.patience);
             self.enter(reconnecting, Action::Connect, patient_until.min(now + DEADLINE));
         } else {
@@ -377,17 +398,19 @@ impl Submission {
 
     fn give_up(&mut self, failure: Failure, now: Instant) {
         match self.stage {
-            Stage::Connecting | Stage::Submitting => self.end(Err(failure)),
+            Stage::Connecting | Stage::Submitting | Stage::Reconnecting { job: None, .. } => {
+                self.end(Err(failure));
+            }
             Stage::Watching { job, .. }
             | Stage::Fetching { job, .. }
-            | Stage::Reconnecting { job, .. } => {
+            | Stage::Reconnecting { job: Some((job, _)), .. } => {
                 self.cancel(job, Err(failure), now);
             }
             Stage::Cancelling { .. } | Stage::Ended => {}
         }
     }
 
-    fn cancel(&mut self, job: JobId, end: Result<Finished, Failure>, now: Instant) {
+    fn cancel(&mut self, job: JobId, end: Result<Ended, Failure>, now: Instant) {
         self.enter(Stage::Cancelling { end }, Action::Cancel(job), now + CANCEL_DEADLINE);
     }
 
@@ -397,7 +420,7 @@ impl Submission {
         }
     }
 
-    fn end(&mut self, end: Result<Finished, Failure>) {
+    fn end(&mut self, end: Result<Ended, Failure>) {
         self.stage = Stage::Ended;
         self.deadline = None;
         self.actions.push_back(Action::End(end));
@@ -448,9 +471,13 @@ mod tests {
 
     impl Bench {
         fn connecting() -> Self {
-            let now = start();
-            let scene = "scene.rt".to_owned();
-            Self { submission: Submission::new(scene, coordinator(), PATIENCE, now), now }
+            Self::with(false)
+        }
+
+        fn with(is_detached: bool) -> Self {
+            let (now, scene) = (start(), "scene.rt".to_owned());
+            let submission = Submission::new(scene, coordinator(), PATIENCE, is_detached, now);
+            Self { submission, now }
         }
 
         fn submitting() -> Self {
@@ -473,7 +500,7 @@ mod tests {
         }
 
         /// The names of the actions since the last time, and how the submission ended.
-        fn actions(&mut self) -> (Vec<String>, Option<Result<Finished, Failure>>) {
+        fn actions(&mut self) -> (Vec<String>, Option<Result<Ended, Failure>>) {
             let mut names = Vec::new();
             let mut end = None;
             while let Some(action) = self.submission.next_action() {
@@ -536,7 +563,36 @@ mod tests {
         assert_eq!(names, [""; 0]);
         let tally = Tally { rays: 5, ..Tally::default() };
         let expected = Finished { size: size(), tally, worker_count: 2, rendering: SECOND };
-        assert_eq!(end.expect("an end").expect("a picture"), expected);
+        let end = end.expect("an end").expect("a picture");
+        assert_eq!(end, Ended::Finished(JOB, expected));
+    }
+
+    #[test]
+    fn a_detached_job_goes_on_when_its_number_is_known() {
+        let mut bench = Bench::with(true);
+        bench.submission.on_connected(bench.now);
+        bench.submission.on_submitted(accepted(), bench.now);
+        let (names, end) = bench.actions();
+        assert_eq!(names, ["Connect", "Submit", r#"TellReport("a warning")"#]);
+        assert_eq!(end.expect("an end").expect("a job"), Ended::Detached(JOB, size()));
+    }
+
+    #[test]
+    fn an_order_whose_answer_is_lost_is_submitted_again() {
+        let mut bench = Bench::submitting();
+        bench.actions();
+        bench.submission.on_trouble(Trouble::Lost("broken pipe".to_owned()), bench.now);
+        bench.check_actions(&[]);
+        assert_eq!(bench.sleep(), FIRST_PAUSE);
+        bench.check_actions(&["Connect"]);
+        bench.submission.on_connected(bench.now);
+        bench.check_actions(&["Submit"]);
+        bench.submission.on_submitted(accepted(), bench.now);
+        bench.check_actions(&[r#"TellReport("a warning")"#, "Watch(JobId(7))"]);
+        let mut bench = Bench::submitting();
+        bench.submission.on_trouble(Trouble::Gone, bench.now);
+        bench.submission.on_stop(bench.now);
+        bench.check_failed(&["Submit"], 130, "interrupted");
     }
 
     #[test]

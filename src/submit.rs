@@ -8,6 +8,7 @@ use std::{
     io::{self, Write},
     ops::ControlFlow,
     panic::resume_unwind,
+    sync::Arc,
 };
 
 use anyhow::Context;
@@ -17,6 +18,7 @@ use rtfarm_proto::{
     Address, Bytes, CHUNK_BYTES, JobId, MESSAGE_BYTES, PROTOCOL, WireError,
     wire::{self, event, jobs_client::JobsClient, submit_request::Part, submit_response},
 };
+use serde_json::json;
 use tokio::{
     sync::mpsc,
     task::{JoinHandle, spawn_blocking},
@@ -33,11 +35,12 @@ use crate::{
     failure::Failure,
     output::Output,
     plain::plain,
+    queue,
     render::Summary,
     scene_files::SceneFiles,
     source::{SceneText, read_named_files},
     submission::{
-        Action, Finished, JobEnd, JobState, Submission, SubmitOutcome, Submitted, Trouble,
+        Action, Ended, Finished, JobEnd, JobState, Submission, SubmitOutcome, Submitted, Trouble,
     },
 };
 
@@ -50,14 +53,19 @@ pub(crate) async fn run(
     let mut output = args.picture.output().map_err(Failure::Input)?;
     output.check()?;
     let text = SceneText::read(&args.picture.scene, stop).await?;
-    let mut submission =
-        Submission::new(args.picture.scene.name(), args.coordinator.clone(), args.patience, now());
+    let (scene, coordinator) = (args.picture.scene.name(), args.coordinator.clone());
+    let mut submission = Submission::new(scene, coordinator, args.patience, args.detach, now());
+    let key = match &args.key {
+        Some(key) => key.clone(),
+        None => random_key()?,
+    };
     let mut shell = Shell {
         args: &args,
         output: &output,
         console,
         stop,
-        text: Some(text),
+        key,
+        text: Arc::new(text),
         client: None,
         farm: Bytes::new(),
         reports: mpsc::channel(1).1,
@@ -68,12 +76,46 @@ pub(crate) async fn run(
     let ended = shell.follow(&mut submission).await;
     shell.close().await;
 
-    let Finished { size, tally, worker_count, rendering } = ended?;
+    let (job, finished) = match ended? {
+        Ended::Finished(job, finished) => (job, finished),
+        Ended::Detached(job, size) => {
+            let JobId(job) = job;
+            let json = json!({
+                "job": job.to_string(), "width": size.width(), "height": size.height(),
+            });
+            return queue::tell(args.json, &json, &job.to_string());
+        }
+    };
+    let Finished { size, tally, worker_count, rendering } = finished;
+    if args.json {
+        let mut json = queue::picture_json(job.0, output.name(), Some(size));
+        json["seconds"] = rendering.as_secs_f64().into();
+        json["workers"] = worker_count.into();
+        json["rays"] = tally.rays.into();
+        json["samples"] = tally.samples.into();
+        json["error"] = tally.error().into();
+        return queue::tell(true, &json, "");
+    }
     let request = args.picture.request(output.format());
     let (sampling, transfer) = (request.quality.sampling, request.transfer);
     let workers = worker_count as usize;
     Summary { size, tally, sampling, transfer, rendering, workers }.tell(started, &output)?;
     Ok(())
+}
+
+/// A key that no other order has.
+fn random_key() -> io::Result<String> {
+    let mut bytes = [0; 16];
+    rustix::rand::getrandom(&mut bytes, rustix::rand::GetRandomFlags::empty())?;
+    Ok(format!("{:032x}", u128::from_ne_bytes(bytes)))
+}
+
+/// The user's login name; his number when nothing tells it.
+fn login_name() -> String {
+    let told = ["USER", "LOGNAME"].iter().filter_map(|name| std::env::var(name).ok());
+    told.into_iter()
+        .find(|name| !name.is_empty())
+        .unwrap_or_else(|| rustix::process::getuid().as_raw().to_string())
 }
 
 fn now() -> std::time::Instant {
@@ -94,8 +136,9 @@ struct Shell<'a> {
     output: &'a Output,
     console: &'a Console,
     stop: &'a CancellationToken,
-    /// The scene's text until it is sent.
-    text: Option<SceneText>,
+    /// Tells the order from every other, though it may be sent again.
+    key: String,
+    text: Arc<SceneText>,
     client: Option<JobsClient<Channel>>,
     /// The id of the farm that took the order.
     farm: Bytes,
@@ -122,7 +165,7 @@ enum Report {
 
 impl Shell<'_> {
     /// Does what is decided, to the end.
-    async fn follow(&mut self, submission: &mut Submission) -> Result<Finished, Failure> {
+    async fn follow(&mut self, submission: &mut Submission) -> Result<Ended, Failure> {
         let stop = self.stop;
         let mut is_stopped = false;
         loop {
@@ -153,7 +196,7 @@ impl Shell<'_> {
         }
     }
 
-    fn execute(&mut self, action: Action) -> ControlFlow<Result<Finished, Failure>> {
+    fn execute(&mut self, action: Action) -> ControlFlow<Result<Ended, Failure>> {
         match action {
             Action::Connect => {
                 let address = self.args.coordinator.clone();
@@ -161,7 +204,7 @@ impl Shell<'_> {
             }
             Action::Submit => {
                 let order = self.order();
-                let (client, text) = (self.client(), self.text.take().expect("it is sent once"));
+                let (client, text) = (self.client(), Arc::clone(&self.text));
                 let scene = &self.args.picture.scene;
                 let (scene_files, name) = (SceneFiles::new(scene), scene.name());
                 self.start(|reports| async move {
@@ -195,7 +238,8 @@ impl Shell<'_> {
             }
             Action::Fetch(job) => {
                 let (send, chunks) = mpsc::channel(2);
-                let request = wire::ImageRequest { job: job.0, farm: self.farm.clone() };
+                let request =
+                    wire::ImageRequest { job: job.0, farm: self.farm.clone(), partial: false };
                 let client = self.client();
                 let reports = self.start(|reports| fetch(client, request, send, reports));
                 self.writing = Some(write(self.output.clone(), self.stop.clone(), chunks, reports));
@@ -297,6 +341,11 @@ impl Shell<'_> {
             quality: Some(request.quality.into()),
             strict: request.strict,
             crop: request.crop.map(Into::into),
+            title: self.args.name.clone().unwrap_or_default(),
+            owner: self.args.owner.clone().unwrap_or_else(login_name),
+            key: self.key.clone(),
+            priority: self.args.priority,
+            max_workers: self.args.max_workers.unwrap_or(0),
             tile_side: request.tile_side.map_or(0, |side| side as u32),
             format: wire::Format::from(request.format).into(),
             transfer: wire::Transfer::from(request.transfer).into(),
@@ -331,7 +380,7 @@ async fn connect(address: Address, reports: mpsc::Sender<Report>) {
 async fn submit(
     mut client: JobsClient<Channel>,
     order: wire::Order,
-    text: SceneText,
+    text: Arc<SceneText>,
     files: BTreeMap<String, Vec<u8>>,
 ) -> Report {
     let (send, parts) = mpsc::channel(2);

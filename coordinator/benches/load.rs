@@ -15,7 +15,7 @@ use std::{
     time::Duration,
 };
 
-use rtfarm_coordinator::{Config, Coordinator, Listener, listen};
+use rtfarm_coordinator::{Config, Coordinator, Keeping, Listener, listen};
 use rtfarm_core::{
     render::{Quality, Sampling},
     tile::{Size, TileGrid},
@@ -79,6 +79,7 @@ async fn run(load: Load, folder: PathBuf) -> Result<(), Error> {
         upload_silence: Duration::from_secs(30),
         scene_folder: scenes.path().to_owned(),
         picture_folder: folder,
+        keeping: Keeping::default(),
     })?;
     let job = tokio::task::spawn_blocking({
         let coordinator = coordinator.clone();

@@ -3,7 +3,7 @@
 //! is to do; nothing here waits, writes or logs.
 
 use std::{
-    collections::{BTreeMap, BTreeSet, VecDeque},
+    collections::{BTreeMap, BTreeSet},
     time::{Duration, Instant},
 };
 
@@ -15,7 +15,7 @@ use crate::{
     audit::Audit,
     identity::{Identity, Stranger},
     lease::{LONGEST_QUIET, Leases, Loss, Run},
-    members::{KeptOut, Members, NoMember, Process},
+    members::{KeptOut, Members, NoMember, Process, Standing},
     tiles::{Arrival, MOST_LOSSES, PixelHash, Rendering, Tiles},
     waiting::{Ask, AskId, Waiting},
 };
@@ -23,9 +23,6 @@ use crate::{
 /// A worker that says nothing for this long is a member no more. One without work asks again
 /// after each wait at the latest.
 const LONGEST_SILENCE: Duration = LONGEST_WAIT.saturating_mul(6);
-
-/// Jobs that have ended and are kept for their clients.
-const KEPT_AFTER_END: usize = 16;
 
 /// A tile that takes so many times what others of its job took is rendered a second time before
 /// tiles of later jobs.
@@ -57,8 +54,9 @@ pub(crate) struct Farm {
     /// It was said that nobody renders tiles again.
     is_told_of_no_audit: bool,
     jobs: BTreeMap<JobId, JobState>,
-    /// Jobs that have ended and are kept, in the order of their ends.
-    ended: VecDeque<JobId>,
+    keeping: Keeping,
+    /// Jobs that have ended and are kept, by the time of their ends.
+    ended: BTreeSet<(Instant, JobId)>,
     /// Jobs of which each tile is in the picture or was set aside, since when.
     finishing: BTreeMap<JobId, Instant>,
     /// When they are looked at again: what they wait for may never come.
@@ -72,6 +70,12 @@ pub(crate) struct Farm {
 struct JobState {
     started: Instant,
     earlier: Earlier,
+    terms: Terms,
+    /// A client was told of it.
+    is_claimed: bool,
+    ended_at: Option<Instant>,
+    /// Its tiles, when it has failed and can be tried again.
+    rest: Option<Tiles>,
     progress: Progress,
     contributors: BTreeSet<WorkerId>,
     /// Workers that brought pixels that make no sense. They get no more tiles of this job while
@@ -175,6 +179,10 @@ pub(crate) enum Action {
     Store(DeliveryId, JobId, TileId),
     /// Answer a delivery.
     Acknowledge(DeliveryId, Verdict),
+    /// Keep that a job has not ended, whatever was kept of its end.
+    Reopen(JobId),
+    /// Keep the terms of a job.
+    Keep(JobId, Terms),
     /// Forget what is kept of tiles that are not in the picture any more.
     TakeBack(JobId, Vec<TileId>),
     /// Show those who watch a job how far it is.
@@ -215,6 +223,12 @@ pub(crate) enum Notice {
     JobFailed(JobId, String),
     /// A client cancelled a job.
     JobCancelled(JobId),
+    /// A job is forgotten, since there is no room or no time for it any more.
+    JobExpired(JobId),
+    /// Somebody changed a job.
+    JobChanged(JobId, Change),
+    /// Somebody decided what a worker gets.
+    Stationed(WorkerId, Standing),
     /// Pixels came of a tile that their worker was never to render under that lease, as the last of
     /// so many.
     NotGranted { worker: WorkerId, lease: LeaseName, tile: TileId, count: u64 },
@@ -225,10 +239,14 @@ pub(crate) enum Notice {
 }
 
 impl JobState {
-    fn new(progress: Progress, earlier: Earlier, now: Instant) -> Self {
+    fn new(progress: Progress, earlier: Earlier, terms: Terms, now: Instant) -> Self {
         Self {
             started: now,
             earlier,
+            terms,
+            is_claimed: false,
+            ended_at: None,
+            rest: None,
             progress,
             contributors: BTreeSet::new(),
             suspects: BTreeSet::new(),
@@ -238,9 +256,10 @@ impl JobState {
         }
     }
 
-    /// How long it has been rendered.
+    /// How long it has been rendered, or was until its end.
     fn elapsed(&self, now: Instant) -> Duration {
-        self.earlier.elapsed + (now - self.started)
+        let until = self.ended_at.unwrap_or(now);
+        self.earlier.elapsed + until.saturating_duration_since(self.started)
     }
 }
 
@@ -259,7 +278,8 @@ impl Farm {
             audit,
             is_told_of_no_audit: false,
             jobs: BTreeMap::new(),
-            ended: VecDeque::new(),
+            keeping: Keeping::default(),
+            ended: BTreeSet::new(),
             finishing: BTreeMap::new(),
             look_at: None,
             last_job: identity.job_before_first(),
@@ -283,7 +303,9 @@ impl Farm {
         let deadline = self.waiting.next_deadline().map(|(until, _)| until);
         let second = self.next_second_rendering().map(|(from, ..)| from);
         let expiry = self.leases.next_expiry();
-        let times = [expiry, self.members.next_check(), deadline, second, farewell, self.look_at];
+        let check = self.members.next_check();
+        let oldest = self.next_oblivion();
+        let times = [expiry, check, deadline, second, farewell, self.look_at, oldest];
         times.into_iter().flatten().min()
     }
 
@@ -297,6 +319,7 @@ impl Farm {
             let reason = format!("silent for {} s", LONGEST_SILENCE.max(self.term).as_secs());
             self.lose_worker(worker, true, &reason, now, &mut actions);
         }
+        self.forget_old(now, &mut actions);
         self.serve(now, &mut actions);
         self.end_farewell(now, &mut actions);
         actions
@@ -456,6 +479,7 @@ impl Farm {
     /// longest, then quiet leases are rendered a second time, then the rest may have waited
     /// long enough.
     fn serve(&mut self, now: Instant, actions: &mut Vec<Action>) {
+        self.send_home_who_is_drained(actions);
         while let Some((id, ask, work)) = self.next_work(now) {
             self.waiting.remove(id);
             let run = match work {
@@ -499,14 +523,14 @@ impl Farm {
         self.waiting.iter().find_map(|(id, ask)| Some((id, ask, self.work_for(ask.worker, now)?)))
     }
 
-    /// What a worker that waits may begin: a tile to compare or free tiles of the earliest job that
-    /// has any, unless one before it has a tile that is overdue, or a suspect, for which the worker
+    /// What a worker that waits may begin: a tile to compare or free tiles of the first job that has
+    /// any, unless one before it has a tile that is overdue, or a suspect, for which the worker
     /// first finishes all else that it has.
     fn work_for(&self, worker: WorkerId, now: Instant) -> Option<Work> {
         if self.leases.is_on_trial(worker) {
             return None;
         }
-        for (job, tiles) in self.leases.jobs().filter(|&(job, _)| self.may_render(worker, job)) {
+        for (job, tiles) in self.leases.jobs().filter(|&(job, _)| self.may_begin(worker, job)) {
             if let Some(tile) = self.audit.work_for(job, worker) {
                 return Some(Work::Audit(job, tile));
             }
@@ -539,9 +563,11 @@ impl Farm {
 
     /// Says whether a worker may have tiles of a job: one under suspicion only if all are.
     fn may_render(&self, worker: WorkerId, job: JobId) -> bool {
-        self.jobs.get(&job).is_none_or(|JobState { suspects, .. }| {
-            !suspects.contains(&worker) || self.members.all(|member| suspects.contains(&member))
-        })
+        let is_active = self.members.is_active(worker);
+        is_active
+            && self.jobs.get(&job).is_none_or(|JobState { suspects, .. }| {
+                !suspects.contains(&worker) || self.members.all(|member| suspects.contains(&member))
+            })
     }
 
     /// From when on which waiting question can be answered with a tile of which quiet lease.
@@ -552,7 +578,7 @@ impl Farm {
             let may = |worker| {
                 worker != quiet.worker
                     && !self.leases.is_on_trial(worker)
-                    && self.may_render(worker, quiet.lease.job)
+                    && self.may_begin(worker, quiet.lease.job)
             };
             let (ask, _) = self.waiting.iter().find(|(_, ask)| may(ask.worker))?;
             Some((quiet.from, ask, quiet.lease.id))
@@ -675,7 +701,7 @@ impl Farm {
             Some((other, _)) => {
                 let tile = tile.number();
                 let reason = format!("workers {other} and {worker} rendered tile {tile}: {reason}");
-                self.fail(lease.job, reason, &mut actions);
+                self.fail(lease.job, reason, now, &mut actions);
             }
             None => {
                 job.suspects.insert(worker);
@@ -699,6 +725,7 @@ impl Farm {
         let delivery = storing.first;
         let Delivery { worker, hash, .. } = delivery;
         let the_first = job.contributors.insert(worker);
+        self.members.on_tile(worker);
         job.progress.tiles_done = done;
         job.progress.tally.add(&delivery.tally);
         job.progress.worker_count = job.earlier.worker_count.max(job.contributors.len() as u32);
@@ -731,9 +758,14 @@ impl Farm {
     }
 
     /// Event: the pixels of a tile cannot be written, for that reason.
-    pub(crate) fn on_store_failed(&mut self, job: JobId, reason: String) -> Vec<Action> {
+    pub(crate) fn on_store_failed(
+        &mut self,
+        job: JobId,
+        reason: String,
+        now: Instant,
+    ) -> Vec<Action> {
         let mut actions = Vec::new();
-        self.fail(job, reason, &mut actions);
+        self.fail(job, reason, now, &mut actions);
         actions
     }
 
@@ -752,6 +784,7 @@ impl Farm {
         id: JobId,
         tiles: Tiles,
         earlier: Earlier,
+        terms: Terms,
         now: Instant,
     ) -> Vec<Action> {
         let progress = Progress {
@@ -764,27 +797,34 @@ impl Farm {
         let is_whole = progress.tiles_done == progress.tile_count;
         let is_begun = progress.tiles_done > 0;
         let mut actions = Vec::from_iter(is_begun.then(|| Action::Publish(id, progress.clone())));
-        let job = JobState::new(progress, earlier, now);
+        let job = JobState::new(progress, earlier, terms, now);
         let elapsed = job.elapsed(now);
         self.jobs.insert(id, job);
-        self.leases.on_submit(id, tiles);
+        self.leases.on_submit(id, tiles, terms.priority);
         if is_whole {
-            self.end(id, Outcome::Finished(elapsed), &mut actions);
+            self.end(id, Outcome::Finished(elapsed), now, &mut actions);
         } else if self.phase == Phase::Open {
             self.serve(now, &mut actions);
         } else {
-            self.fail(id, STOPPED.to_owned(), &mut actions);
+            self.fail(id, STOPPED.to_owned(), now, &mut actions);
         }
         actions
     }
 
-    /// Event: a job that has ended so is there for its clients, as an earlier start of the farm
-    /// kept it.
-    pub(crate) fn on_kept(&mut self, id: JobId, progress: Progress, now: Instant) -> Vec<Action> {
+    /// Event: a job that has ended so, and as long ago, is there for its clients, as an earlier start
+    /// of the farm kept it.
+    pub(crate) fn on_kept(
+        &mut self,
+        id: JobId,
+        progress: Progress,
+        terms: Terms,
+        (age, now): (Duration, Instant),
+    ) -> Vec<Action> {
         debug_assert!(progress.outcome.is_some(), "it has ended");
         let mut actions = vec![Action::Publish(id, progress.clone())];
-        self.jobs.insert(id, JobState::new(progress, Earlier::default(), now));
-        self.keep_ended(id, &mut actions);
+        self.jobs.insert(id, JobState::new(progress, Earlier::default(), terms, now));
+        self.keep_ended(id, now.checked_sub(age).unwrap_or(now));
+        self.forget_old(now, &mut actions);
         actions
     }
 
@@ -794,12 +834,11 @@ impl Farm {
     }
 
     /// Event: nobody wants a job's picture any more.
-    pub(crate) fn on_cancel(&mut self, job: JobId) -> Vec<Action> {
+    pub(crate) fn on_cancel(&mut self, job: JobId, now: Instant) -> Vec<Action> {
         let mut actions = Vec::new();
-        if self.end(job, Outcome::Failed("it was cancelled".to_owned()), &mut actions) {
+        if self.end(job, Outcome::Failed("it was cancelled".to_owned()), now, &mut actions) {
             actions.push(Action::Log(Notice::JobCancelled(job)));
         }
-        self.ended.retain(|&ended| ended != job);
         self.forget(job, &mut actions);
         actions
     }
@@ -831,9 +870,9 @@ impl Farm {
             }
             let time = self.jobs.get(&id).map_or(Duration::ZERO, |job| job.elapsed(now));
             if let Some(reason) = self.failure(id) {
-                self.fail(id, reason, actions);
+                self.fail(id, reason, now, actions);
             } else {
-                self.end(id, Outcome::Finished(time), actions);
+                self.end(id, Outcome::Finished(time), now, actions);
             }
         }
         self.look_at = (!self.finishing.is_empty()).then(|| now + self.term);
@@ -863,18 +902,35 @@ impl Farm {
             .then(|| format!("{right} of {count} tiles are right; {}", reasons.join("; ")))
     }
 
-    fn fail(&mut self, job: JobId, reason: String, actions: &mut Vec<Action>) {
-        if self.end(job, Outcome::Failed(reason.clone()), actions) {
+    fn fail(&mut self, job: JobId, reason: String, now: Instant, actions: &mut Vec<Action>) {
+        if self.end(job, Outcome::Failed(reason.clone()), now, actions) {
             actions.push(Action::Log(Notice::JobFailed(job, reason)));
         }
     }
 
     /// Ends a job, unless it has ended; says whether it had not. What is being stored of it is
-    /// not needed any more.
-    fn end(&mut self, id: JobId, outcome: Outcome, actions: &mut Vec<Action>) -> bool {
+    /// not needed any more, and tiles of which nobody knows whether they are right are out of the
+    /// picture.
+    fn end(
+        &mut self,
+        id: JobId,
+        outcome: Outcome,
+        now: Instant,
+        actions: &mut Vec<Action>,
+    ) -> bool {
         let Some(job) = self.jobs.get_mut(&id) else { return false };
         if job.progress.outcome.is_some() {
             return false;
+        }
+        let tiles = self.leases.on_end(id);
+        if let (Outcome::Failed(_), Some(mut tiles)) = (&outcome, tiles) {
+            let wrong = std::mem::take(&mut job.unsettled);
+            tiles.reopen(&wrong);
+            job.progress.tiles_done = tiles.done_count();
+            if !wrong.is_empty() {
+                actions.push(Action::TakeBack(id, wrong.into_iter().collect()));
+            }
+            job.rest = Some(tiles);
         }
         job.progress.outcome = Some(outcome);
         actions.push(Action::Publish(id, job.progress.clone()));
@@ -883,27 +939,11 @@ impl Farm {
             let deliveries = std::iter::once(storing.id).chain(copies);
             actions.extend(deliveries.map(|id| Action::Acknowledge(id, Verdict::Rejected)));
         }
-        self.leases.on_end(id);
         self.audit.on_end(id);
         self.finishing.remove(&id);
-        self.keep_ended(id, actions);
+        self.keep_ended(id, now);
+        self.forget_old(now, actions);
         true
-    }
-
-    /// Keeps a job that has ended for its clients; another one may have to go.
-    fn keep_ended(&mut self, id: JobId, actions: &mut Vec<Action>) {
-        self.ended.push_back(id);
-        if self.ended.len() > KEPT_AFTER_END
-            && let Some(oldest) = self.ended.pop_front()
-        {
-            self.forget(oldest, actions);
-        }
-    }
-
-    fn forget(&mut self, job: JobId, actions: &mut Vec<Action>) {
-        if self.jobs.remove(&job).is_some() {
-            actions.push(Action::Forget(job));
-        }
     }
 
     // Stopping.
@@ -928,7 +968,7 @@ impl Farm {
         if !self.keeps_jobs {
             let jobs: Vec<JobId> = self.jobs.keys().copied().collect();
             for job in jobs {
-                self.fail(job, STOPPED.to_owned(), &mut actions);
+                self.fail(job, STOPPED.to_owned(), now, &mut actions);
             }
         }
         self.phase = Phase::Farewell(now + FAREWELL);
@@ -957,7 +997,7 @@ impl Farm {
 impl Farm {
     /// Event: a picture of these tiles, all of them free, is ordered.
     pub(crate) fn on_submit(&mut self, id: JobId, tiles: Tiles, now: Instant) -> Vec<Action> {
-        self.on_order(id, tiles, Earlier::default(), now)
+        self.on_order(id, tiles, Earlier::default(), Terms::default(), now)
     }
 
     /// Which start of the farm this is.
@@ -975,16 +1015,23 @@ impl Farm {
         for (id, job) in &self.jobs {
             let tiles = self.leases.tiles(*id);
             assert_eq!(tiles.is_some(), job.progress.outcome.is_none());
-            assert_eq!(self.ended.contains(id), job.progress.outcome.is_some());
+            assert_eq!(job.ended_at.is_some(), job.progress.outcome.is_some());
+            assert!(job.ended_at.is_none_or(|end| self.ended.contains(&(end, *id))));
+            assert!(job.rest.is_none() || job.ended_at.is_some());
             let done = tiles.map_or(job.progress.tiles_done, Tiles::done_count);
             assert_eq!(done, job.progress.tiles_done);
             assert!(tiles.is_some() || job.storing.is_empty());
         }
-        assert!(self.ended.len() <= KEPT_AFTER_END);
+        let ended = self.jobs.values().filter(|job| job.ended_at.is_some());
+        assert_eq!(self.ended.len(), ended.count());
     }
 }
 
+mod queue;
 mod trust;
+
+pub use queue::Keeping;
+pub(crate) use queue::{Change, JobEntry, Phase as JobPhase, Refused, Terms};
 
 #[cfg(test)]
 mod tests;

@@ -9,7 +9,8 @@ use rtfarm_proto::{JobId, TileHasher};
 use tokio::sync::watch;
 
 use crate::{
-    record::{Plan, to_event},
+    farm::Terms,
+    record::{JobRecord, Plan, Ticket, to_event},
     state::JobFolder,
     store::SceneFile,
 };
@@ -18,6 +19,7 @@ use crate::{
 #[derive(Debug)]
 pub struct Job {
     pub(crate) id: JobId,
+    pub(crate) ticket: Ticket,
     pub(crate) scene: SceneFile,
     pub(crate) settings: Settings,
     pub(crate) grid: TileGrid,
@@ -33,6 +35,7 @@ impl Job {
     /// Makes one of which nothing is known to be done.
     pub(crate) fn new(
         id: JobId,
+        ticket: Ticket,
         plan: &Plan,
         scene: SceneFile,
         canvas: Canvas,
@@ -42,7 +45,7 @@ impl Job {
         let hasher = TileHasher::new(id, scene.hash(), settings, grid);
         let progress = Progress { tile_count: grid.count(), ..Progress::default() };
         let progress = watch::Sender::new(progress);
-        Arc::new(Self { id, scene, settings, grid, hasher, canvas, folder, progress })
+        Arc::new(Self { id, ticket, scene, settings, grid, hasher, canvas, folder, progress })
     }
 
     /// Its number.
@@ -86,6 +89,31 @@ impl Job {
         }
     }
 
+    /// Has it outlive this process as one that has not ended.
+    pub(crate) fn reopen(&self) {
+        self.change(|record| record.end = None);
+    }
+
+    /// Has its terms outlive this process.
+    pub(crate) fn keep(&self, terms: Terms) {
+        self.change(|record| {
+            (record.priority, record.is_paused) = (terms.priority, terms.is_paused);
+        });
+    }
+
+    fn change(&self, change: impl FnOnce(&mut JobRecord)) {
+        let changed = self.folder.as_ref().map(|folder| folder.change(change));
+        if let Some(Err(error)) = changed {
+            tracing::error!(job = self.id.0, reason = %error, "cannot keep a change of a job");
+        }
+    }
+
+    /// Bytes on disk that are kept for it.
+    pub(crate) fn byte_count(&self) -> u64 {
+        let picture = self.picture();
+        self.scene.byte_count() + Picture::byte_count(picture.size(), picture.format())
+    }
+
     /// Removes what outlives this process.
     pub(crate) fn forget(&self) {
         if let Some(Err(error)) = self.folder.as_ref().map(JobFolder::forget) {
@@ -98,8 +126,9 @@ impl Job {
 fn replace_older(shown: &mut Progress, progress: Progress) -> bool {
     // One of these grows with every change, and none before it shrinks.
     let age = |progress: &Progress| {
-        let Progress { tiles_done, differing_tiles, taken_back, outcome, .. } = progress;
-        (outcome.is_some(), *taken_back, *tiles_done, *differing_tiles)
+        let Progress { tiles_done, differing_tiles, taken_back, retry_count, outcome, .. } =
+            progress;
+        (*retry_count, outcome.is_some(), *taken_back, *tiles_done, *differing_tiles)
     };
     let is_older = age(shown) < age(&progress);
     if is_older {

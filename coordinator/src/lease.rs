@@ -3,6 +3,7 @@
 //! lost and when its job ends. A tile that stands still leaves its lease by itself.
 
 use std::{
+    cmp::Reverse,
     collections::{BTreeMap, BTreeSet},
     time::{Duration, Instant},
 };
@@ -47,6 +48,8 @@ pub(crate) struct Leases {
     term: Duration,
     last_id: LeaseId,
     jobs: BTreeMap<JobId, Job>,
+    /// The same jobs in the order in which they are rendered.
+    order: BTreeSet<(Reverse<i32>, JobId)>,
     with_free: BTreeSet<JobId>,
     with_suspects: BTreeSet<JobId>,
     held: BTreeMap<LeaseId, Lease>,
@@ -59,6 +62,7 @@ pub(crate) struct Leases {
 #[derive(Debug)]
 struct Job {
     tiles: Tiles,
+    priority: i32,
     pace: Pace,
     /// Every lease that was ever given, and what it covered.
     granted: BTreeMap<LeaseId, Grant>,
@@ -148,6 +152,7 @@ impl Leases {
             term,
             last_id: LeaseId(0),
             jobs: BTreeMap::new(),
+            order: BTreeSet::new(),
             with_free: BTreeSet::new(),
             with_suspects: BTreeSet::new(),
             held: BTreeMap::new(),
@@ -181,9 +186,21 @@ impl Leases {
         })
     }
 
-    /// The jobs that are being rendered, the earliest first, and their tiles.
+    /// The jobs that are being rendered and their tiles: those of the highest priority first, of
+    /// these the earliest.
     pub(crate) fn jobs(&self) -> impl Iterator<Item = (JobId, &Tiles)> {
-        self.jobs.iter().map(|(&id, job)| (id, &job.tiles))
+        self.order.iter().map(|&(_, id)| (id, &self.jobs[&id].tiles))
+    }
+
+    /// The workers that have leases of a job.
+    pub(crate) fn workers_of(&self, job: JobId) -> BTreeSet<WorkerId> {
+        let of_job = (job, LeaseId(0))..=(job, LeaseId(u64::MAX));
+        self.by_job.range(of_job).map(|(_, id)| self.held[id].worker).collect()
+    }
+
+    /// How many tiles a worker has.
+    pub(crate) fn tile_count(&self, worker: WorkerId) -> usize {
+        self.of(worker).map(|id| self.held[&id].count()).sum()
     }
 
     /// Says whether any job has a free tile, be it under suspicion.
@@ -208,20 +225,33 @@ impl Leases {
     }
 
     /// Event: a job is to be rendered, of which no tile is in a lease.
-    pub(crate) fn on_submit(&mut self, id: JobId, tiles: Tiles) {
-        self.jobs.insert(id, Job { tiles, pace: Pace::default(), granted: BTreeMap::new() });
+    pub(crate) fn on_submit(&mut self, id: JobId, tiles: Tiles, priority: i32) {
+        let (pace, granted) = (Pace::default(), BTreeMap::new());
+        self.jobs.insert(id, Job { tiles, priority, pace, granted });
+        self.order.insert((Reverse(priority), id));
         self.index_job(id);
     }
 
-    /// Event: nobody is to render a job any longer.
-    pub(crate) fn on_end(&mut self, job: JobId) {
+    /// Event: a job is to be rendered before those of lower priority.
+    pub(crate) fn on_priority(&mut self, id: JobId, priority: i32) {
+        let Some(job) = self.jobs.get_mut(&id) else { return };
+        self.order.remove(&(Reverse(job.priority), id));
+        job.priority = priority;
+        self.order.insert((Reverse(priority), id));
+    }
+
+    /// Event: nobody is to render a job any longer. Answers with its tiles, if it was rendered.
+    pub(crate) fn on_end(&mut self, job: JobId) -> Option<Tiles> {
         let of_job = (job, LeaseId(0))..=(job, LeaseId(u64::MAX));
         let ended: Vec<LeaseId> = self.by_job.range(of_job).map(|&(_, id)| id).collect();
         for id in ended {
             self.remove(id);
         }
-        self.jobs.remove(&job);
+        let ended = self.jobs.remove(&job);
         self.index_job(job);
+        let Job { tiles, priority, .. } = ended?;
+        self.order.remove(&(Reverse(priority), job));
+        Some(tiles)
     }
 
     /// Event: `worker`, with `threads` of the farm's `all_threads`, would render up to `most` free
@@ -682,6 +712,8 @@ impl Leases {
             assert_eq!(self.with_free.contains(job), tiles.free_count() > 0);
             assert_eq!(self.with_suspects.contains(job), tiles.has_suspect());
         }
+        let order = self.jobs.iter().map(|(&id, job)| (Reverse(job.priority), id));
+        assert!(self.order == order.collect());
         let mut with = self.with_free.union(&self.with_suspects);
         assert!(with.all(|job| self.jobs.contains_key(job)));
         for (id, lease) in &self.held {
@@ -746,7 +778,7 @@ mod tests {
     fn job(columns: u64, rows: u64) -> (Leases, Instant) {
         let grid = TileGrid::new(Size::new(columns * 16, rows * 16).unwrap(), 16).unwrap();
         let mut leases = Leases::new(TERM);
-        leases.on_submit(JOB, Tiles::new(grid));
+        leases.on_submit(JOB, Tiles::new(grid), 0);
         #[expect(clippy::disallowed_methods, reason = "any instant will do")]
         let start = Instant::now();
         (leases, start)

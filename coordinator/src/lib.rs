@@ -40,6 +40,7 @@ mod waiting;
 mod whole_farm;
 
 pub use accept::listen;
+pub use farm::Keeping;
 pub use job::Job;
 pub use run::{Coordinator, Listener};
 pub use shell::{Config, SubmitError};

@@ -39,17 +39,41 @@ pub(crate) struct Members {
     by_nonce: BTreeMap<u64, WorkerId>,
     by_process: BTreeSet<(u32, WorkerId)>,
     checks: BTreeSet<(Instant, WorkerId)>,
+    draining: BTreeSet<WorkerId>,
     threads: usize,
     /// Liars, members once, and the nonces of their processes.
     liars: BTreeSet<WorkerId>,
     kept_out: BTreeMap<u64, WorkerId>,
 }
 
+/// What a worker gets to do.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Standing {
+    /// Tiles.
+    Active,
+    /// No more tiles; it goes home when it has brought those that it has.
+    Draining,
+    /// No more tiles, until it is active again.
+    Disabled,
+}
+
+/// A worker as those see it who look after a farm.
+#[derive(Debug, Clone)]
+pub(crate) struct MemberEntry {
+    pub(crate) worker: WorkerId,
+    pub(crate) process: Process,
+    pub(crate) standing: Standing,
+    /// Tiles that it brought first.
+    pub(crate) tiles_done: u64,
+    /// Since it was heard of.
+    pub(crate) silence: Duration,
+}
+
 #[derive(Debug)]
 struct Member {
-    nonce: u64,
-    process: u32,
-    threads: usize,
+    process: Process,
+    standing: Standing,
+    tiles_done: u64,
     last_heard: Instant,
     /// When its silence is looked at. A sign of life does not move it, the look itself does: so
     /// one is as cheap as can be.
@@ -66,6 +90,7 @@ impl Members {
             by_nonce: BTreeMap::new(),
             by_process: BTreeSet::new(),
             checks: BTreeSet::new(),
+            draining: BTreeSet::new(),
             threads: 0,
             liars: BTreeSet::new(),
             kept_out: BTreeMap::new(),
@@ -89,17 +114,18 @@ impl Members {
         }
         self.last_id.0 += 1;
         let worker = self.last_id;
+        let process = Process { threads: process.threads.max(1), ..process.clone() };
+        self.by_nonce.insert(process.nonce, worker);
+        self.by_process.insert((process.number, worker));
+        self.threads += process.threads;
         let member = Member {
-            nonce: process.nonce,
-            process: process.number,
-            threads: process.threads.max(1),
+            process,
+            standing: Standing::Active,
+            tiles_done: 0,
             last_heard: now,
             check_at: now + self.longest_silence,
         };
-        self.by_nonce.insert(member.nonce, worker);
-        self.by_process.insert((member.process, worker));
         self.checks.insert((member.check_at, worker));
-        self.threads += member.threads;
         self.by_id.insert(worker, member);
         Ok((worker, true))
     }
@@ -109,7 +135,7 @@ impl Members {
     pub(crate) fn on_lie(&mut self, liar: WorkerId) {
         self.liars.insert(liar);
         if let Some(member) = self.by_id.get(&liar) {
-            self.kept_out.insert(member.nonce, liar);
+            self.kept_out.insert(member.process.nonce, liar);
         }
     }
 
@@ -138,10 +164,11 @@ impl Members {
     /// Removes a worker; says whether it was a member.
     pub(crate) fn remove(&mut self, worker: WorkerId) -> bool {
         let Some(member) = self.by_id.remove(&worker) else { return false };
-        self.by_nonce.remove(&member.nonce);
-        self.by_process.remove(&(member.process, worker));
+        self.by_nonce.remove(&member.process.nonce);
+        self.by_process.remove(&(member.process.number, worker));
         self.checks.remove(&(member.check_at, worker));
-        self.threads -= member.threads;
+        self.draining.remove(&worker);
+        self.threads -= member.process.threads;
         true
     }
 
@@ -171,7 +198,7 @@ impl Members {
 
     /// The threads of a worker, and those of all members.
     pub(crate) fn threads(&self, worker: WorkerId) -> (usize, usize) {
-        (self.by_id.get(&worker).map_or(0, |member| member.threads), self.threads)
+        (self.by_id.get(&worker).map_or(0, |member| member.process.threads), self.threads)
     }
 
     /// The first member that runs in the process with that number.
@@ -180,9 +207,53 @@ impl Members {
         self.by_process.range(of_process).next().map(|&(_, worker)| worker)
     }
 
-    /// Says whether something is true of every member.
+    /// Says whether something is true of every active member.
     pub(crate) fn all(&self, is_true: impl Fn(WorkerId) -> bool) -> bool {
-        self.by_id.keys().all(|&worker| is_true(worker))
+        let active = self.by_id.iter().filter(|(_, member)| member.standing == Standing::Active);
+        active.map(|(&worker, _)| worker).all(is_true)
+    }
+
+    /// Event: somebody decides what a worker is to get.
+    pub(crate) fn on_station(
+        &mut self,
+        worker: WorkerId,
+        standing: Standing,
+    ) -> Result<(), NoMember> {
+        self.by_id.get_mut(&worker).ok_or(NoMember(worker))?.standing = standing;
+        if standing == Standing::Draining {
+            self.draining.insert(worker);
+        } else {
+            self.draining.remove(&worker);
+        }
+        Ok(())
+    }
+
+    /// Says whether a worker is a member that gets tiles.
+    pub(crate) fn is_active(&self, worker: WorkerId) -> bool {
+        self.by_id.get(&worker).is_some_and(|member| member.standing == Standing::Active)
+    }
+
+    /// The members that are to go home.
+    pub(crate) fn draining(&self) -> impl Iterator<Item = WorkerId> {
+        self.draining.iter().copied()
+    }
+
+    /// Event: the first pixels of a tile, which a worker brought, are in a picture.
+    pub(crate) fn on_tile(&mut self, worker: WorkerId) {
+        if let Some(member) = self.by_id.get_mut(&worker) {
+            member.tiles_done += 1;
+        }
+    }
+
+    /// All members, in the order of their numbers.
+    pub(crate) fn entries(&self, now: Instant) -> impl Iterator<Item = MemberEntry> {
+        self.by_id.iter().map(move |(&worker, member)| MemberEntry {
+            worker,
+            process: member.process.clone(),
+            standing: member.standing,
+            tiles_done: member.tiles_done,
+            silence: now - member.last_heard,
+        })
     }
 
     /// Says whether there is nobody.
@@ -200,14 +271,23 @@ impl Members {
     /// Checks every invariant, at the price of a scan.
     pub(crate) fn check(&self) {
         let members = || self.by_id.iter();
-        assert!(self.by_nonce == members().map(|(&id, member)| (member.nonce, id)).collect());
-        assert!(self.by_process == members().map(|(&id, member)| (member.process, id)).collect());
+        assert!(
+            self.by_nonce == members().map(|(&id, member)| (member.process.nonce, id)).collect()
+        );
+        let of_process = members().map(|(&id, member)| (member.process.number, id));
+        assert!(self.by_process == of_process.collect());
+        let is_draining = |member: &Member| member.standing == Standing::Draining;
+        let draining = members().filter(|(_, member)| is_draining(member)).map(|(&id, _)| id);
+        assert!(self.draining == draining.collect());
         assert!(self.checks == members().map(|(&id, member)| (member.check_at, id)).collect());
         assert!(
             members()
                 .all(|(_, member)| { member.check_at <= member.last_heard + self.longest_silence })
         );
-        assert_eq!(self.threads, members().map(|(_, member)| member.threads).sum::<usize>());
+        assert_eq!(
+            self.threads,
+            members().map(|(_, member)| member.process.threads).sum::<usize>()
+        );
     }
 }
 

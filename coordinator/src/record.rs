@@ -47,6 +47,33 @@ pub(crate) struct JobRecord {
     /// How far it was at its end, once it has ended.
     #[prost(message, optional, tag = "6")]
     pub(crate) end: Option<wire::Event>,
+    /// Who wants it.
+    #[prost(string, tag = "7")]
+    pub(crate) owner: String,
+    /// An order with the same is for the same job.
+    #[prost(string, tag = "8")]
+    pub(crate) key: String,
+    #[prost(sint32, tag = "9")]
+    pub(crate) priority: i32,
+    #[prost(bool, tag = "10")]
+    pub(crate) is_paused: bool,
+    /// The most workers that render it at the same time; 0: any number.
+    #[prost(uint32, tag = "11")]
+    pub(crate) most_workers: u32,
+}
+
+/// What a client says of a job besides what it renders.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub(crate) struct Ticket {
+    /// What it is called.
+    pub(crate) name: String,
+    /// Who wants it.
+    pub(crate) owner: String,
+    /// Another order with the same key is for the same job; empty if none is.
+    pub(crate) key: String,
+    pub(crate) priority: i32,
+    /// That render it at the same time.
+    pub(crate) most_workers: Option<u32>,
 }
 
 /// What a job renders.
@@ -92,7 +119,7 @@ pub(crate) fn unseal<M: Message + Default>(bytes: &[u8]) -> Result<M, RecordErro
 }
 
 impl JobRecord {
-    pub(crate) fn new(name: String, build: &str, plan: &Plan) -> Self {
+    pub(crate) fn new(ticket: &Ticket, build: &str, plan: &Plan) -> Self {
         let &Plan { scene, scene_byte_count, settings, grid, format, transfer } = plan;
         let job = wire::Job {
             scene_hash: scene.0.to_vec().into(),
@@ -102,14 +129,26 @@ impl JobRecord {
             tile_side: grid.side(),
             window: Some(Crop::from(grid.window()).into()),
         };
+        let Ticket { name, owner, key, priority, most_workers } = ticket.clone();
         Self {
             name,
+            owner,
+            key,
+            priority,
+            is_paused: false,
+            most_workers: most_workers.unwrap_or(0),
             build: build.to_owned(),
             job: Some(job),
             format: wire::Format::from(format).into(),
             transfer: wire::Transfer::from(transfer).into(),
             end: None,
         }
+    }
+
+    pub(crate) fn ticket(&self) -> Ticket {
+        let Self { name, owner, key, priority, most_workers, .. } = self.clone();
+        let most_workers = (most_workers > 0).then_some(most_workers);
+        Ticket { name, owner, key, priority, most_workers }
     }
 
     pub(crate) fn plan(&self) -> Result<Plan, RecordError> {

@@ -19,10 +19,11 @@ use rtfarm_proto::{JobId, LeaseName, WorkerId, pixels_to_bytes};
 use tempfile::TempDir;
 
 use crate::{
-    farm::{Delivery, Next, Verdict},
+    farm::{Delivery, Keeping, Next, Verdict},
     identity::Identity,
     job::Job,
     members::Process,
+    record::Ticket,
     shell::{Config, Shell},
     state::{Durability, StateError, StateFolder},
 };
@@ -72,6 +73,7 @@ impl Coordinator {
             build: BUILD.to_owned(),
             reference: None,
             audit: 0.0,
+            keeping: Keeping::default(),
             term: Duration::from_secs(4),
             upload_silence: Duration::from_secs(4),
             scene_folder: PathBuf::new(),
@@ -140,9 +142,9 @@ struct Told {
 async fn work(folder: &Path, disk: Disk, durability: Durability) -> Told {
     let mut told = Told::default();
     let Ok(farm) = Coordinator::open(disk.clone(), folder, durability) else { return told };
-    let first = farm.shell.submit(order());
+    let first = farm.shell.submit(order(), Ticket::default());
     told.jobs.extend(first.as_ref().map(|job| job.id).ok());
-    let second = farm.shell.submit(order());
+    let second = farm.shell.submit(order(), Ticket::default());
     told.jobs.extend(second.as_ref().map(|job| job.id).ok());
     if let Ok(first) = first {
         farm.shell.cancel(first.id);
@@ -195,7 +197,7 @@ async fn check_at_every_change(disk_at: fn(u64) -> Disk, durability: Durability)
                 None => panic!("{context}: it does not end"),
             }
         }
-        let next = farm.shell.submit(order()).unwrap().id;
+        let next = farm.shell.submit(order(), Ticket::default()).unwrap().id;
         assert!(told.jobs.iter().all(|&id| id < next), "{context}: a number is given twice");
         let left = std::fs::read_dir(path.join("jobs")).unwrap();
         let is_job = |name: String| name.parse::<u64>().is_ok();
@@ -248,9 +250,9 @@ async fn a_foreign_a_used_and_a_damaged_folder_are_refused_and_left_alone() {
 
     let path = folder.path().join("state");
     let farm = Coordinator::open(Disk::default(), &path, Durability::Second).unwrap();
-    let id = farm.shell.submit(order()).unwrap().id;
+    let id = farm.shell.submit(order(), Ticket::default()).unwrap().id;
     farm.render().await;
-    let running = farm.shell.submit(order()).unwrap().id;
+    let running = farm.shell.submit(order(), Ticket::default()).unwrap().id;
     assert_eq!((id, running), (JobId(1), JobId(2)));
     let process = std::process::id();
     check_refused(&path, &format!("another coordinator (process {process}) uses the state in"));
@@ -288,15 +290,15 @@ async fn a_job_that_another_build_began_fails_and_says_why() {
     let folder = TempDir::new().unwrap();
     let path = folder.path().join("state");
     let farm = Coordinator::open(Disk::default(), &path, Durability::Second).unwrap();
-    farm.shell.submit(order()).unwrap();
+    farm.shell.submit(order(), Ticket::default()).unwrap();
     farm.render().await;
-    farm.shell.submit(order()).unwrap();
+    farm.shell.submit(order(), Ticket::default()).unwrap();
     drop(farm);
     let ends: Vec<Option<Outcome>> = open(&path, "1.2.4")
         .unwrap()
         .kept
         .into_iter()
-        .map(|job| job.end.and_then(|end| end.outcome))
+        .map(|job| job.end.and_then(|end| end.0.outcome))
         .collect();
     let [Some(Outcome::Finished(_)), Some(Outcome::Failed(reason))] = &ends[..] else {
         panic!("{ends:?}")
@@ -309,7 +311,7 @@ async fn a_farm_that_stops_in_good_order_goes_on_later() {
     let folder = TempDir::new().unwrap();
     let path = folder.path().join("state");
     let farm = Coordinator::open(Disk::default(), &path, Durability::Second).unwrap();
-    let job = farm.shell.submit(order()).unwrap();
+    let job = farm.shell.submit(order(), Ticket::default()).unwrap();
     let first = farm.lease().await[0];
     assert!(farm.deliver(first));
     let name = farm.shell.identity;

@@ -24,6 +24,7 @@ use crate::{
     accept::{WAITING, accept_all},
     identity::Identity,
     job::Job,
+    record::Ticket,
     service,
     shell::{Config, Shell, SubmitError},
     state::StateFolder,
@@ -72,7 +73,8 @@ impl Coordinator {
 
     /// Takes an order. This writes files: never call it on the async runtime.
     pub fn submit(&self, order: Order) -> Result<Arc<Job>, SubmitError> {
-        self.shell.submit(order)
+        let ticket = Ticket { name: order.name.clone(), ..Ticket::default() };
+        self.shell.submit(order, ticket)
     }
 
     /// Takes an order whose picture is `canvas`, cut as the order says; these tiles are in it already.
@@ -83,7 +85,8 @@ impl Coordinator {
         canvas: Canvas,
         done: &[(TileId, TileRecord)],
     ) -> Result<Arc<Job>, SubmitError> {
-        self.shell.submit_on(self.shell.number_job(), order, canvas, done)
+        let ticket = Ticket { name: order.name.clone(), ..Ticket::default() };
+        self.shell.submit_on(self.shell.number_job(), (order, ticket), canvas, done)
     }
 
     /// Ends a job, if it has not ended, and forgets it.

@@ -19,7 +19,10 @@ use rtfarm_picture::TilePixels;
 use rtfarm_proto::{
     CHUNK_BYTES, JobId, LONGEST_WAIT, LeaseName, MESSAGE_BYTES, PROTOCOL, Renewal, WireError,
     WorkerId, scene_hash, transfer,
-    wire::{self, farm_server, jobs_server, lease_response, submit_request, submit_response},
+    wire::{
+        self, control_request, farm_server, jobs_server, lease_response, submit_request,
+        submit_response,
+    },
 };
 use tokio::sync::{mpsc, oneshot};
 use tokio_stream::{Stream, wrappers::ReceiverStream};
@@ -33,13 +36,13 @@ use tonic::{
 };
 
 use crate::{
-    farm::{Delivery, Next, Verdict},
+    farm::{Change, Delivery, JobEntry, JobPhase, Next, Refused, Verdict},
     identity::Stranger,
     job::Job,
     lease::Run,
-    members::{NoMember, Process},
-    record::to_event,
-    shell::{Config, Shell},
+    members::{MemberEntry, NoMember, Process, Standing},
+    record::{Ticket, to_event},
+    shell::{ChangeError, Config, Shell},
     tiles::PixelHash,
 };
 
@@ -251,12 +254,17 @@ impl jobs_server::Jobs for JobsService {
         &self,
         request: Request<Streaming<wire::SubmitRequest>>,
     ) -> Result<Response<wire::SubmitResponse>, Status> {
-        let Bundle { order, text, files } = receive(request.into_inner(), &self.shell).await?;
+        let bundle = match receive(request.into_inner(), &self.shell).await? {
+            Received::Known(job) => return Ok(Response::new(accepted(&job, &self.shell))),
+            Received::New(bundle) => bundle,
+        };
+        let Bundle { order, text, files } = *bundle;
+        let ticket = to_ticket(&order);
         let wanted = to_request(order).map_err(invalid)?;
         let shell = Arc::clone(&self.shell);
         let client_gone = CancellationToken::new();
         let _here = client_gone.clone().drop_guard();
-        let (outcome, report, unclaimed) = blocking(move || {
+        let (answer, unclaimed) = blocking(move || {
             let resolve = |path: &str| {
                 files.get(path).cloned().ok_or_else(|| {
                     let reason = format!("`{path}` was not sent along with the scene");
@@ -271,28 +279,26 @@ impl jobs_server::Jobs for JobsService {
                 return Err(Status::cancelled("the client is gone"));
             }
             let job = order.and_then(|order| {
-                shell.submit(order).map_err(|error| Refusal::Other(error.to_string()))
+                shell.submit(order, ticket).map_err(|error| Refusal::Other(error.to_string()))
             });
-            let job_id = job.as_ref().ok().map(|job| job.id);
-            let identity = shell.identity;
-            let unclaimed = job_id.map(|job| Unclaimed { shell, job: Some(job) });
-            let outcome = match job {
-                Ok(job) => submit_response::Outcome::Accepted(wire::Accepted {
-                    job: job.id.0,
-                    frame: Some(job.grid.window().size().into()),
-                    tile_count: job.grid.count(),
-                    farm: identity.farm.0.to_vec().into(),
-                }),
-                Err(Refusal::Scene) => submit_response::Outcome::Refused(String::new()),
-                Err(Refusal::Other(reason)) => submit_response::Outcome::Refused(reason),
+            let refused = |reason| wire::SubmitResponse {
+                outcome: Some(submit_response::Outcome::Refused(reason)),
+                report: String::new(),
             };
-            Ok((outcome, report, unclaimed))
+            let job_id = job.as_ref().ok().map(|job| job.id);
+            let answer = match job {
+                Ok(job) => accepted(&job, &shell),
+                Err(Refusal::Scene) => refused(String::new()),
+                Err(Refusal::Other(reason)) => refused(reason),
+            };
+            let unclaimed = job_id.map(|job| Unclaimed { shell, job: Some(job) });
+            Ok((wire::SubmitResponse { report, ..answer }, unclaimed))
         })
         .await?;
         if let Some(mut unclaimed) = unclaimed {
             unclaimed.job = None;
         }
-        Ok(Response::new(wire::SubmitResponse { outcome: Some(outcome), report }))
+        Ok(Response::new(answer))
     }
 
     type WatchStream = Events;
@@ -329,9 +335,9 @@ impl jobs_server::Jobs for JobsService {
         &self,
         request: Request<wire::ImageRequest>,
     ) -> Result<Response<Chunks>, Status> {
-        let wire::ImageRequest { job, farm } = request.into_inner();
+        let wire::ImageRequest { job, farm, partial } = request.into_inner();
         let job = self.job(job, &farm)?;
-        if !matches!(job.progress.borrow().outcome, Some(Outcome::Finished(_))) {
+        if !partial && !matches!(job.progress.borrow().outcome, Some(Outcome::Finished(_))) {
             return Err(Status::failed_precondition("the job has not finished"));
         }
         let folder = self.shell.config.picture_folder.clone();
@@ -358,8 +364,63 @@ impl jobs_server::Jobs for JobsService {
     ) -> Result<Response<wire::CancelResponse>, Status> {
         let wire::CancelRequest { job, farm } = request.into_inner();
         self.shell.admit_client(&farm).map_err(stranger)?;
-        self.shell.cancel(JobId(job));
-        Ok(Response::new(wire::CancelResponse {}))
+        let was_known = self.shell.cancel(JobId(job));
+        Ok(Response::new(wire::CancelResponse { was_known }))
+    }
+
+    async fn list(
+        &self,
+        _: Request<wire::ListRequest>,
+    ) -> Result<Response<wire::ListResponse>, Status> {
+        let jobs = self.shell.jobs();
+        let jobs = jobs.iter().map(|(entry, job)| to_job_entry(entry, job)).collect();
+        Ok(Response::new(wire::ListResponse { jobs }))
+    }
+
+    async fn control(
+        &self,
+        request: Request<wire::ControlRequest>,
+    ) -> Result<Response<wire::ControlResponse>, Status> {
+        let wire::ControlRequest { job, farm, change } = request.into_inner();
+        self.shell.admit_client(&farm).map_err(stranger)?;
+        let change = match change.ok_or_else(|| invalid(WireError::Missing("change")))? {
+            control_request::Change::Paused(is_paused) => Change::Pause(is_paused),
+            control_request::Change::Priority(priority) => Change::Priority(priority),
+            control_request::Change::Retry(wire::Nothing {}) => Change::Retry,
+        };
+        let shell = Arc::clone(&self.shell);
+        blocking(move || {
+            shell.change(JobId(job), change).map_err(|error| match error {
+                ChangeError::Refused(Refused::Unknown) => Status::not_found(error.to_string()),
+                ChangeError::Refused(_) => Status::failed_precondition(error.to_string()),
+                ChangeError::Picture(_) => Status::internal(error.to_string()),
+            })
+        })
+        .await?;
+        Ok(Response::new(wire::ControlResponse {}))
+    }
+
+    async fn workers(
+        &self,
+        _: Request<wire::WorkersRequest>,
+    ) -> Result<Response<wire::WorkersResponse>, Status> {
+        let workers = self.shell.workers().into_iter().map(to_worker_entry).collect();
+        Ok(Response::new(wire::WorkersResponse { workers }))
+    }
+
+    async fn station(
+        &self,
+        request: Request<wire::StationRequest>,
+    ) -> Result<Response<wire::StationResponse>, Status> {
+        let request = request.into_inner();
+        let standing = match request.standing() {
+            wire::Standing::Active => Standing::Active,
+            wire::Standing::Draining => Standing::Draining,
+            wire::Standing::Disabled => Standing::Disabled,
+            wire::Standing::Unspecified => return Err(invalid(WireError::Missing("standing"))),
+        };
+        let was_known = self.shell.station(WorkerId(request.worker), standing).is_ok();
+        Ok(Response::new(wire::StationResponse { was_known }))
     }
 }
 
@@ -381,8 +442,66 @@ struct Unclaimed {
 impl Drop for Unclaimed {
     fn drop(&mut self) {
         if let Some(job) = self.job {
-            self.shell.cancel(job);
+            self.shell.abandon(job);
         }
+    }
+}
+
+/// The answer to a client whose job there is.
+fn accepted(job: &Job, shell: &Shell) -> wire::SubmitResponse {
+    let accepted = wire::Accepted {
+        job: job.id.0,
+        frame: Some(job.grid.window().size().into()),
+        tile_count: job.grid.count(),
+        farm: shell.identity.farm.0.to_vec().into(),
+    };
+    let outcome = Some(submit_response::Outcome::Accepted(accepted));
+    wire::SubmitResponse { outcome, report: String::new() }
+}
+
+fn to_job_entry(entry: &JobEntry, job: &Job) -> wire::JobEntry {
+    let JobEntry { id, phase, terms, workers_now, progress, elapsed, expires_in } = entry;
+    let state = match phase {
+        JobPhase::Waiting => wire::JobState::Waiting,
+        JobPhase::Rendering => wire::JobState::Rendering,
+        JobPhase::Paused => wire::JobState::Paused,
+        JobPhase::Finished => wire::JobState::Finished,
+        JobPhase::Failed => wire::JobState::Failed,
+    };
+    wire::JobEntry {
+        job: id.0,
+        name: job.ticket.name.clone(),
+        owner: job.ticket.owner.clone(),
+        state: state.into(),
+        priority: terms.priority,
+        max_workers: terms.most_workers.unwrap_or(0),
+        workers_now: *workers_now as u32,
+        progress: Some(to_event(progress)),
+        seconds: elapsed.as_secs_f64(),
+        bytes: terms.byte_count,
+        expires_in: expires_in.unwrap_or_default().as_secs_f64(),
+        frame: Some(job.grid.window().size().into()),
+    }
+}
+
+fn to_worker_entry((entry, tiles_leased): (MemberEntry, usize)) -> wire::WorkerEntry {
+    let MemberEntry { worker, process, standing, tiles_done, silence } = entry;
+    let Process { number, threads, host, isa, .. } = process;
+    let standing = match standing {
+        Standing::Active => wire::Standing::Active,
+        Standing::Draining => wire::Standing::Draining,
+        Standing::Disabled => wire::Standing::Disabled,
+    };
+    wire::WorkerEntry {
+        worker: worker.0,
+        host,
+        process: number,
+        threads: threads as u32,
+        isa,
+        standing: standing.into(),
+        tiles_leased: tiles_leased as u32,
+        tiles_done,
+        silence: silence.as_secs_f64(),
     }
 }
 
@@ -393,7 +512,14 @@ struct Bundle {
     files: HashMap<String, Vec<u8>>,
 }
 
-async fn receive(parts: Streaming<wire::SubmitRequest>, shell: &Shell) -> Result<Bundle, Status> {
+/// What a client sent.
+enum Received {
+    New(Box<Bundle>),
+    /// An order whose job is there already.
+    Known(Arc<Job>),
+}
+
+async fn receive(parts: Streaming<wire::SubmitRequest>, shell: &Shell) -> Result<Received, Status> {
     let mut parts = Upload { parts, silence: shell.config.upload_silence };
     // What is not wanted is refused before it is sent.
     let Some(submit_request::Part::Order(order)) = parts.next().await?.and_then(|part| part.part)
@@ -401,6 +527,9 @@ async fn receive(parts: Streaming<wire::SubmitRequest>, shell: &Shell) -> Result
         return Err(invalid(WireError::Missing("order")));
     };
     check_version("client", &order.version, order.protocol, shell)?;
+    if let Some(job) = shell.claim(&order.key) {
+        return Ok(Received::Known(job));
+    }
     let (mut text, mut files) = (Vec::new(), HashMap::<String, Vec<u8>>::new());
     let mut byte_count = 0;
     while let Some(part) = parts.next().await? {
@@ -422,7 +551,7 @@ async fn receive(parts: Streaming<wire::SubmitRequest>, shell: &Shell) -> Result
             return Err(Status::resource_exhausted("the scene and its files are too long"));
         }
     }
-    Ok(Bundle { order, text, files })
+    Ok(Received::New(Box::new(Bundle { order, text, files })))
 }
 
 /// What a client sends, piece by piece.
@@ -442,6 +571,13 @@ impl Upload {
             Err(Status::deadline_exceeded(reason))
         })
     }
+}
+
+fn to_ticket(order: &wire::Order) -> Ticket {
+    let wire::Order { name, title, owner, key, priority, max_workers, .. } = order.clone();
+    let name = if title.is_empty() { name } else { title };
+    let most_workers = (max_workers > 0).then_some(max_workers);
+    Ticket { name, owner, key, priority, most_workers }
 }
 
 fn to_request(order: wire::Order) -> Result<RenderRequest, WireError> {

@@ -10,7 +10,10 @@ use std::{
     time::{Duration, Instant},
 };
 
-use rtfarm_core::{prepared::SceneHash, tile::TileId};
+use rtfarm_core::{
+    prepared::SceneHash,
+    tile::{TileGrid, TileId},
+};
 use rtfarm_job::{FinishedTile, Order, Progress};
 use rtfarm_picture::{Canvas, CanvasTile, TileRecord};
 use rtfarm_proto::{Bytes, Incarnation, JobId, LeaseName, Renewal, WorkerId};
@@ -19,12 +22,15 @@ use tokio_util::sync::CancellationToken;
 
 use crate::{
     audit::Audit,
-    farm::{Action, Delivery, DeliveryId, Earlier, Farm, Next, Notice, Verdict},
+    farm::{
+        Action, Change, Delivery, DeliveryId, Earlier, Farm, JobEntry, Keeping, Next, Notice,
+        Refused, Terms, Verdict,
+    },
     identity::{Identity, Stranger},
     job::Job,
     lease::Run,
-    members::{KeptOut, NoMember, Process},
-    record::Plan,
+    members::{KeptOut, MemberEntry, NoMember, Process, Standing},
+    record::{Plan, Ticket},
     state::{Durability, KeptJob, StateFolder},
     store::SceneFile,
     tiles::{MOST_LOSSES, Tiles},
@@ -46,6 +52,8 @@ pub struct Config {
     /// Of the tiles, from 0 to 1, that another worker renders again, to compare; besides those each
     /// worker's first of a job, unless this is 0.
     pub audit: f64,
+    /// How long jobs that have ended are kept.
+    pub keeping: Keeping,
     /// A client that sends nothing of its scene for this long is given up.
     pub upload_silence: Duration,
     /// For prepared scenes: a folder that is nobody else's.
@@ -68,6 +76,15 @@ pub enum SubmitError {
     State(io::Error),
 }
 
+/// Why a job is not changed.
+#[derive(Debug, thiserror::Error)]
+pub(crate) enum ChangeError {
+    #[error(transparent)]
+    Refused(Refused),
+    #[error("cannot read the picture: {0}")]
+    Picture(io::Error),
+}
+
 /// The machine and all that its answers concern.
 #[derive(Debug)]
 pub(crate) struct Shell {
@@ -81,6 +98,8 @@ pub(crate) struct Shell {
     written: Notify,
     /// Held for a moment: nothing is written and nobody is waited for under it.
     state: Mutex<State>,
+    /// Held while a job is made or changed and that is kept: one at a time.
+    changing: Mutex<()>,
     /// Told when the machine wants to be woken earlier than it will be.
     earlier: Notify,
     /// Cancelled when everybody has gone home: connections are to be closed.
@@ -134,6 +153,8 @@ enum Work {
     Store(Arc<Job>, Vec<(TileId, Bytes, TileRecord)>),
     /// Forgets what is kept of tiles.
     TakeBack(Arc<Job>, Vec<TileId>),
+    Reopen(Arc<Job>),
+    Keep(Arc<Job>, Terms),
     /// Removes the files of a job that nobody else has in hand.
     Drop(Arc<Job>),
 }
@@ -161,10 +182,11 @@ impl Shell {
         mut folder: Option<StateFolder>,
     ) -> Self {
         let audit = Audit::new(config.audit, secret);
-        let farm = match &folder {
+        let mut farm = match &folder {
             Some(folder) => Farm::keeping_jobs(identity, config.term, audit, folder.last_job()),
             None => Farm::new(identity, config.term, audit),
         };
+        farm.keep(config.keeping);
         let kept = folder.as_mut().map(|folder| std::mem::take(&mut folder.kept));
         let state = State {
             farm,
@@ -181,6 +203,7 @@ impl Shell {
             unsynced: Mutex::default(),
             written: Notify::new(),
             state: Mutex::new(state),
+            changing: Mutex::default(),
             earlier: Notify::new(),
             stop: CancellationToken::new(),
         };
@@ -262,6 +285,13 @@ impl Shell {
                 let job = state.jobs.get(&job).cloned();
                 works.in_order.extend(job.map(|job| Work::TakeBack(job, tiles)));
             }
+            Action::Reopen(job) => {
+                works.in_order.extend(state.jobs.get(&job).cloned().map(Work::Reopen));
+            }
+            Action::Keep(job, terms) => {
+                let job = state.jobs.get(&job).cloned();
+                works.in_order.extend(job.map(|job| Work::Keep(job, terms)));
+            }
             Action::Forget(job) => {
                 works.in_order.extend(state.jobs.remove(&job).map(Work::Drop));
             }
@@ -274,9 +304,13 @@ impl Shell {
         match work {
             Work::Log(notice) => log(*notice),
             Work::Drop(job) => job.forget(),
+            Work::Reopen(job) => job.reopen(),
+            Work::Keep(job, terms) => job.keep(terms),
             Work::TakeBack(job, tiles) => {
                 if let Err(error) = job.canvas.clear(&tiles) {
-                    self.tell_farm(|farm, _| farm.on_store_failed(job.id, error.to_string()));
+                    self.tell_farm(|farm, now| {
+                        farm.on_store_failed(job.id, error.to_string(), now)
+                    });
                 }
             }
             Work::Store(job, tiles) => {
@@ -289,7 +323,9 @@ impl Shell {
                 match job.canvas.put_all(&put.collect::<Vec<_>>()) {
                     Ok(()) => self.on_written(&job, &numbers),
                     Err(error) => {
-                        self.tell_farm(|farm, _| farm.on_store_failed(job.id, error.to_string()));
+                        self.tell_farm(|farm, now| {
+                            farm.on_store_failed(job.id, error.to_string(), now)
+                        });
                     }
                 }
             }
@@ -333,7 +369,7 @@ impl Shell {
                 Ok(()) => self.on_stored(job.id, &tiles),
                 Err(error) => {
                     let reason = format!("cannot make the picture safe: {error}");
-                    self.tell_farm(|farm, _| farm.on_store_failed(job.id, reason));
+                    self.tell_farm(|farm, now| farm.on_store_failed(job.id, reason, now));
                 }
             }
         }
@@ -466,27 +502,49 @@ impl Shell {
         self.tell_farm(|farm, now| farm.on_process_exit(process, reason, now));
     }
 
-    /// Takes an order. This writes files: never call it on the async runtime.
-    pub(crate) fn submit(&self, order: Order) -> Result<Arc<Job>, SubmitError> {
+    /// Takes an order, or finds the job of an earlier one with the same key. This writes files: never
+    /// call it on the async runtime.
+    pub(crate) fn submit(&self, order: Order, ticket: Ticket) -> Result<Arc<Job>, SubmitError> {
+        let _alone = self.changing.lock().expect("writing never panics");
+        if let Some(job) = self.claim(&ticket.key) {
+            return Ok(job);
+        }
         let id = self.state().farm.number_job();
         let Some(folder) = &self.folder else {
             let picture_folder = &self.config.picture_folder;
             let canvas = Canvas::new_in(picture_folder, order.grid, order.format, order.transfer);
             let canvas =
                 canvas.map_err(|error| SubmitError::Picture(picture_folder.clone(), error))?;
-            return self.submit_on(id, order, canvas, &[]);
+            return self.submit_on(id, (order, ticket), canvas, &[]);
         };
-        let Order { name, prepared, settings, grid, transfer, format } = order;
+        let Order { name: _, prepared, settings, grid, transfer, format } = order;
         let scene_byte_count = prepared.as_ref().len() as u64;
         let plan =
             Plan { scene: prepared.hash(), scene_byte_count, settings, grid, format, transfer };
         let same = self.job_with_scene(plan.scene);
         let same = same.as_ref().map(|job| job.scene.path());
-        let kept = folder.create_job(id, (name.clone(), &plan), &prepared, same);
+        let kept = folder.create_job(id, (&ticket, &plan), &prepared, same);
         let (scene, canvas, folder) = kept.map_err(SubmitError::State)?;
-        let job = Job::new(id, &plan, scene, canvas, Some(folder));
-        self.begin(&job, &name, Tiles::new(grid), Earlier::default());
+        let job = Job::new(id, ticket, &plan, scene, canvas, Some(folder));
+        self.begin(&job, Tiles::new(grid), Earlier::default(), false);
         Ok(job)
+    }
+
+    /// The job of an earlier order with this key, which another client is told of now.
+    pub(crate) fn claim(&self, key: &str) -> Option<Arc<Job>> {
+        self.tell(|state, _| {
+            let job = state.jobs.values().find(|job| !key.is_empty() && job.ticket.key == key);
+            let job = job.cloned();
+            if let Some(job) = &job {
+                state.farm.on_claim(job.id);
+            }
+            (job, Vec::new())
+        })
+    }
+
+    /// Who submitted a job has gone before he was told of it.
+    pub(crate) fn abandon(&self, job: JobId) {
+        self.tell_farm(|farm, now| farm.on_abandon(job, now));
     }
 
     /// Gives a number to a job that [`Shell::submit_on`] takes.
@@ -499,27 +557,27 @@ impl Shell {
     pub(crate) fn submit_on(
         &self,
         id: JobId,
-        order: Order,
+        (order, ticket): (Order, Ticket),
         canvas: Canvas,
         done: &[(TileId, TileRecord)],
     ) -> Result<Arc<Job>, SubmitError> {
         let scene_folder = &self.config.scene_folder;
-        let Order { name, prepared, settings, grid, transfer, format } = order;
+        let Order { name: _, prepared, settings, grid, transfer, format } = order;
         let scene = SceneFile::write(scene_folder, &prepared)
             .map_err(|error| SubmitError::Scene(scene_folder.clone(), error))?;
         drop(prepared);
         let (hash, scene_byte_count) = (scene.hash(), scene.byte_count());
         let plan = Plan { scene: hash, scene_byte_count, settings, grid, format, transfer };
-        let job = Job::new(id, &plan, scene, canvas, None);
-        let (tiles, earlier) = progress_of(&plan, done);
-        self.begin(&job, &name, tiles, earlier);
+        let job = Job::new(id, ticket, &plan, scene, canvas, None);
+        let (tiles, earlier) = progress_of(grid, done);
+        self.begin(&job, tiles, earlier, false);
         Ok(job)
     }
 
-    fn begin(&self, job: &Arc<Job>, name: &str, tiles: Tiles, earlier: Earlier) {
+    fn begin(&self, job: &Arc<Job>, tiles: Tiles, earlier: Earlier, is_paused: bool) {
         tracing::info!(
             job = job.id.0,
-            scene = name,
+            scene = job.ticket.name,
             size = %job.grid.window().size(),
             sampling = %job.settings.quality.sampling,
             transfer = ?job.canvas.picture().transfer(),
@@ -531,27 +589,67 @@ impl Shell {
         );
         self.tell(|state, now| {
             state.jobs.insert(job.id, Arc::clone(job));
-            ((), state.farm.on_order(job.id, tiles, earlier, now))
+            let terms = terms_of(job, is_paused, false);
+            ((), state.farm.on_order(job.id, tiles, earlier, terms, now))
         });
     }
 
     /// Goes on with a job that an earlier coordinator left.
     fn take_up(&self, kept: KeptJob) {
-        let KeptJob { id, name, plan, scene, canvas, done, end, folder } = kept;
-        let job = Job::new(id, &plan, scene, canvas, Some(folder));
-        if let Some(end) = end {
+        let KeptJob { id, ticket, is_paused, is_foreign, plan, scene, canvas, done, end, folder } =
+            kept;
+        let job = Job::new(id, ticket, &plan, scene, canvas, Some(folder));
+        if let Some((end, age)) = end {
+            let terms = terms_of(&job, is_paused, is_foreign);
             self.tell(|state, now| {
                 state.jobs.insert(id, job);
-                ((), state.farm.on_kept(id, end, now))
+                ((), state.farm.on_kept(id, end, terms, (age, now)))
             });
         } else {
-            let (tiles, earlier) = progress_of(&plan, &done);
-            self.begin(&job, &name, tiles, earlier);
+            let (tiles, earlier) = progress_of(plan.grid, &done);
+            self.begin(&job, tiles, earlier, is_paused);
         }
     }
 
-    pub(crate) fn cancel(&self, job: JobId) {
-        self.tell_farm(|farm, _| farm.on_cancel(job));
+    /// Ends and forgets a job; says whether it was known.
+    pub(crate) fn cancel(&self, job: JobId) -> bool {
+        self.tell(|state, now| (state.jobs.contains_key(&job), state.farm.on_cancel(job, now)))
+    }
+
+    /// Changes a job. This reads and writes files: never call it on the async runtime.
+    pub(crate) fn change(&self, job: JobId, change: Change) -> Result<(), ChangeError> {
+        let _alone = self.changing.lock().expect("writing never panics");
+        let changed = self.tell(|state, now| state.farm.on_change(job, change, now));
+        let (Err(Refused::TilesUnknown), Some(known)) = (changed, self.job(job)) else {
+            return changed.map_err(ChangeError::Refused);
+        };
+        // It failed under an earlier start.
+        let done = known.canvas.done().map_err(ChangeError::Picture)?;
+        let tiles = progress_of(known.grid, &done);
+        self.tell(|state, now| state.farm.on_retry(job, Some(tiles), now))
+            .map_err(ChangeError::Refused)
+    }
+
+    /// The jobs that are known, and what there is to say of them.
+    pub(crate) fn jobs(&self) -> Vec<(JobEntry, Arc<Job>)> {
+        self.tell(|state, now| {
+            let entries = state.farm.job_entries(now).into_iter();
+            let known = |entry: JobEntry| {
+                let job = state.jobs.get(&entry.id).cloned()?;
+                Some((entry, job))
+            };
+            (entries.filter_map(known).collect(), Vec::new())
+        })
+    }
+
+    /// The workers, and how many tiles each has.
+    pub(crate) fn workers(&self) -> Vec<(MemberEntry, usize)> {
+        self.tell(|state, now| (state.farm.worker_entries(now), Vec::new()))
+    }
+
+    /// Decides what a worker gets.
+    pub(crate) fn station(&self, worker: WorkerId, standing: Standing) -> Result<(), NoMember> {
+        self.tell(|state, now| state.farm.on_station(worker, standing, now))
     }
 
     pub(crate) fn close(&self) {
@@ -573,10 +671,17 @@ impl Shell {
     }
 }
 
+/// What the machine knows of a job besides its tiles.
+fn terms_of(job: &Job, is_paused: bool, is_foreign: bool) -> Terms {
+    let Ticket { priority, most_workers, .. } = job.ticket;
+    let byte_count = job.byte_count();
+    Terms { priority, is_paused, most_workers, byte_count, is_foreign }
+}
+
 /// A picture's tiles, of which some are done, and what was done so far.
-fn progress_of(plan: &Plan, done: &[(TileId, TileRecord)]) -> (Tiles, Earlier) {
+fn progress_of(grid: TileGrid, done: &[(TileId, TileRecord)]) -> (Tiles, Earlier) {
     // Not under the lock: there may be a million.
-    let (mut tiles, mut earlier) = (Tiles::new(plan.grid), Earlier::default());
+    let (mut tiles, mut earlier) = (Tiles::new(grid), Earlier::default());
     for (tile, record) in done {
         tiles.set_done(*tile, record.arrived);
         earlier.tally.add(&record.tally);
@@ -719,6 +824,13 @@ fn log(notice: Notice) {
         ),
         Notice::Strangers(count) => {
             tracing::warn!(count, "calls meant for another start of a coordinator were refused");
+        }
+        Notice::JobExpired(job) => {
+            tracing::info!(job = job.0, "job forgotten: it was kept long enough");
+        }
+        Notice::JobChanged(job, change) => tracing::info!(job = job.0, ?change, "job changed"),
+        Notice::Stationed(worker, standing) => {
+            tracing::info!(worker = worker.0, ?standing, "worker's standing changed");
         }
         Notice::JobCancelled(job) => tracing::info!(job = job.0, "job cancelled"),
     }

@@ -16,7 +16,7 @@ use rtfarm_proto::{Incarnation, JobId, LeaseId, LeaseName, Renewal, WorkerId};
 
 use crate::{
     audit::Audit,
-    farm::{Action, Delivery, DeliveryId, Earlier, Farm, Next, Notice, Verdict},
+    farm::{Action, Delivery, DeliveryId, Earlier, Farm, Next, Notice, Terms, Verdict},
     identity::Identity,
     members::Process,
     tiles::{PixelHash, Tiles},
@@ -261,6 +261,7 @@ impl World {
                 Action::TakeBack(job, tiles) => {
                     for tile in tiles {
                         assert!(self.picture.remove(&(job, tile)).is_some());
+                        assert!(self.logged.remove(&(job, tile)));
                     }
                 }
                 Action::Forget(job) => assert!(self.forgotten.insert(job)),
@@ -278,15 +279,15 @@ impl World {
                     assert!(self.liars.contains(&worker), "worker {worker} is honest");
                     self.caught_count += 1;
                 }
-                Action::Log(Notice::TakenBack { worker, job, tiles }) => {
+                Action::Log(Notice::TakenBack { worker, .. }) => {
                     assert!(self.liars.contains(&worker));
-                    assert!(tiles.iter().all(|&tile| self.logged.remove(&(job, tile))));
                 }
                 Action::Log(Notice::NoAudit) => self.was_without_audit = true,
                 Action::Log(Notice::NotCompared(job, _)) => {
                     self.not_compared.insert(job);
                 }
                 Action::Log(_) => {}
+                Action::Reopen(_) | Action::Keep(..) => panic!("nobody changes jobs here"),
                 Action::Stop => self.has_stopped = true,
             }
         }
@@ -306,7 +307,7 @@ impl World {
         let written: Vec<_> = self.disk.extract_if(.., |(end, ..)| *end <= now).collect();
         for (_, job, tile, shown) in written {
             let actions = if self.random.one_in(1000) {
-                self.farm.on_store_failed(job, "the disk is full".to_owned())
+                self.farm.on_store_failed(job, "the disk is full".to_owned(), self.now)
             } else {
                 self.picture.entry((job, tile)).or_default().push(shown);
                 self.farm.on_stored(job, tile, now)
@@ -373,7 +374,7 @@ impl World {
             let nth = self.random.below(JOBS as u64) as usize;
             let job = self.jobs.keys().nth(nth).copied().unwrap_or(JobId(7));
             let is_known = self.jobs.contains_key(&job) && !self.forgotten.contains(&job);
-            let actions = self.farm.on_cancel(job);
+            let actions = self.farm.on_cancel(job, self.now);
             let forgets = actions.iter().any(|action| matches!(action, Action::Forget(_)));
             assert_eq!(forgets, is_known);
             self.act(actions);
@@ -422,7 +423,8 @@ impl World {
                 tiles.set_done(tile, written[0]);
             }
             self.set_aside.retain(|(job, _)| *job != id);
-            let actions = self.farm.on_order(id, tiles, Earlier::default(), self.now);
+            let actions =
+                self.farm.on_order(id, tiles, Earlier::default(), Terms::default(), self.now);
             self.act(actions);
         }
     }

@@ -17,6 +17,7 @@ use std::{
     os::unix::fs::DirBuilderExt,
     path::{Path, PathBuf},
     sync::Mutex,
+    time::Duration,
 };
 
 use rtfarm_core::{
@@ -32,7 +33,7 @@ use rustix::{
 };
 
 use crate::{
-    record::{FarmRecord, JobRecord, Plan, RecordError, seal, to_progress, unseal},
+    record::{FarmRecord, JobRecord, Plan, RecordError, Ticket, seal, to_progress, unseal},
     store::SceneFile,
 };
 
@@ -93,14 +94,17 @@ pub struct StateFolder {
 #[derive(Debug)]
 pub(crate) struct KeptJob {
     pub(crate) id: JobId,
-    pub(crate) name: String,
+    pub(crate) ticket: Ticket,
+    pub(crate) is_paused: bool,
+    /// Another build began it.
+    pub(crate) is_foreign: bool,
     pub(crate) plan: Plan,
     pub(crate) scene: SceneFile,
     pub(crate) canvas: Canvas,
     /// The tiles in its picture, unless it has ended.
     pub(crate) done: Vec<(TileId, TileRecord)>,
-    /// How far it was at its end.
-    pub(crate) end: Option<Progress>,
+    /// How far it was at its end, and how long ago that was.
+    pub(crate) end: Option<(Progress, Duration)>,
     pub(crate) folder: JobFolder,
 }
 
@@ -235,7 +239,12 @@ impl StateFolder {
             }
             done = canvas.done().map_err(|error| damaged("", &error))?;
         }
-        Ok(KeptJob { id, name: record.name, plan, scene, canvas, done, end, folder })
+        let ticket = record.ticket();
+        let (is_paused, is_foreign) = (record.is_paused, record.build != self.build);
+        // The record is written last at its end.
+        let age = || fs::metadata(path.join(JOB)).ok()?.modified().ok()?.elapsed().ok();
+        let end = end.map(|end| (end, age().unwrap_or_default()));
+        Ok(KeptJob { id, ticket, is_paused, is_foreign, plan, scene, canvas, done, end, folder })
     }
 
     /// Keeps a job before anybody is told of it. `same` is a file with the same scene, if there is
@@ -243,7 +252,7 @@ impl StateFolder {
     pub(crate) fn create_job(
         &self,
         id: JobId,
-        (name, plan): (String, &Plan),
+        (ticket, plan): (&Ticket, &Plan),
         prepared: &PreparedBytes,
         same: Option<&Path>,
     ) -> io::Result<(SceneFile, Canvas, JobFolder)> {
@@ -255,7 +264,7 @@ impl StateFolder {
             SceneFile::keep(&begun.join(SCENE), prepared, same, &self.disk)?;
             let looks = (plan.format, plan.transfer);
             let canvas = Canvas::create(&begun, plan.grid, looks, &self.subject(id), &self.disk)?;
-            let record = JobRecord::new(name, &self.build, plan);
+            let record = JobRecord::new(ticket, &self.build, plan);
             self.disk.replace(&begun.join(JOB), &seal(&record))?;
             self.disk.change(|| fs::rename(&begun, &path))?;
             self.disk.sync_folder(&jobs)?;

@@ -262,6 +262,21 @@ impl Tiles {
         }
     }
 
+    /// Frees every tile that is not in the picture, and those that are but are `wrong`. Nobody holds
+    /// any, or is to hold it.
+    pub(crate) fn reopen(&mut self, wrong: &BTreeSet<TileId>) {
+        (self.suspects, self.aside, self.losses) = Default::default();
+        for (&id, place) in self.order.iter().zip((0..).map(Place)) {
+            let state = &mut self.by_number[id.index()].state;
+            let is_done = matches!(state, State::Done { .. });
+            if !is_done || wrong.contains(&id) {
+                *state = State::Open(Holders::NONE);
+                self.free.insert(place);
+                self.done_count -= u32::from(is_done);
+            }
+        }
+    }
+
     /// Frees the tiles in the picture that `worker` rendered and no other confirmed.
     pub(crate) fn take_back(&mut self, worker: WorkerId) -> Vec<TileId> {
         let mut taken = Vec::new();

@@ -51,6 +51,7 @@ use tonic::{
 
 use crate::{
     Config,
+    farm::Keeping,
     identity::Identity,
     service::{FarmService, JobsService, services},
     shell::Shell,
@@ -318,6 +319,7 @@ impl World {
             upload_silence: Duration::from_secs(5),
             scene_folder: self.folder.path().to_owned(),
             picture_folder: self.folder.path().to_owned(),
+            keeping: Keeping::default(),
         };
         let shell = Arc::new(Shell::new(config, identity, [count as u8; 32], folder));
         let (farm, jobs) = services(&shell);
@@ -786,7 +788,7 @@ impl World {
 }
 
 async fn image(client: &mut JobsClient<Net>, job: u64, farm: &Bytes) -> Result<Vec<u8>, Trouble> {
-    let chunks = client.image(wire::ImageRequest { job, farm: farm.clone() }).await;
+    let chunks = client.image(wire::ImageRequest { job, farm: farm.clone(), partial: false }).await;
     let (mut chunks, mut file) = (chunks?.into_inner(), Vec::new());
     while let Some(chunk) = chunks.message().await? {
         file.extend_from_slice(&chunk.data);

@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use rtfarm_coordinator::{Config, Coordinator, Listener};
+use rtfarm_coordinator::{Config, Coordinator, Keeping, Listener};
 use rtfarm_core::{
     prepared::SceneHash,
     render::{Quality, Sampling, Settings},
@@ -54,6 +54,7 @@ impl Farm {
             reference: Some(REFERENCE),
             term: Duration::from_millis(300),
             audit: 0.0,
+            keeping: Keeping::default(),
             upload_silence: Duration::from_millis(600),
             scene_folder: folder.path().to_owned(),
             picture_folder: folder.path().to_owned(),
@@ -315,7 +316,7 @@ async fn strangers_are_told_what_is_wrong() {
     assert_eq!(farm.tiles.fetch(request).await.unwrap_err().code(), Code::NotFound);
     let request = wire::WatchRequest { job: 77, farm: farm.named.clone() };
     assert_eq!(farm.jobs.watch(request).await.unwrap_err().code(), Code::NotFound);
-    let request = wire::ImageRequest { job: farm.job, farm: farm.named.clone() };
+    let request = wire::ImageRequest { job: farm.job, farm: farm.named.clone(), partial: false };
     assert_eq!(farm.jobs.image(request).await.unwrap_err().code(), Code::FailedPrecondition);
 }
 

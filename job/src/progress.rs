@@ -19,6 +19,8 @@ pub struct Progress {
     pub differing_tiles: u32,
     /// Tiles that were taken out of the picture again, since their worker was found to lie.
     pub taken_back: u32,
+    /// How often it was tried again after it had failed.
+    pub retry_count: u32,
     /// How it ended, once it has.
     pub outcome: Option<Outcome>,
 }

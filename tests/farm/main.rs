@@ -2,6 +2,7 @@
 //! logs that count, nothing left behind.
 
 mod faults;
+mod queue;
 
 use std::{
     collections::BTreeSet,

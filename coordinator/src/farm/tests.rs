@@ -44,6 +44,15 @@ impl World {
         (job, actions)
     }
 
+    /// Orders a picture of a row of tiles on these terms.
+    fn submit_with(&mut self, tile_count: u64, terms: Terms) -> JobId {
+        let grid = TileGrid::new(Size::new(tile_count * 16, 16).unwrap(), 16).unwrap();
+        let job = self.farm.number_job();
+        self.farm.on_order(job, Tiles::new(grid), Earlier::default(), terms, self.now);
+        self.farm.check();
+        job
+    }
+
     /// Asks for up to nine tiles.
     fn ask(&mut self, worker: WorkerId, wait: Duration) -> (AskId, Vec<Action>) {
         let id = AskId(self.number());
@@ -270,7 +279,7 @@ fn a_picture_that_cannot_be_written_ends_its_job() {
     let run = world.lease(worker);
     let (first, _) = world.deliver(worker, &run, 7);
     let (copy, _) = world.deliver(worker, &run, 7);
-    let actions = world.farm.on_store_failed(job, "the disk is full".to_owned());
+    let actions = world.farm.on_store_failed(job, "the disk is full".to_owned(), world.now);
     let expected = [(first, Verdict::Rejected), (copy, Verdict::Rejected)];
     assert_eq!(verdicts(&actions), expected);
     let failed = Outcome::Failed("the disk is full".to_owned());
@@ -666,7 +675,7 @@ fn a_cancelled_job_fails_for_those_who_watch_and_is_forgotten() {
     let (job, _) = world.submit(2);
     let run = world.lease(worker);
     let (delivery, _) = world.deliver(worker, &run, 7);
-    let actions = world.farm.on_cancel(job);
+    let actions = world.farm.on_cancel(job, world.now);
     world.farm.check();
     let reason = Outcome::Failed("it was cancelled".to_owned());
     assert_eq!(shown(&actions).outcome, Some(reason));
@@ -675,24 +684,192 @@ fn a_cancelled_job_fails_for_those_who_watch_and_is_forgotten() {
     assert!(world.store(&run).is_empty(), "nobody wants it any more");
     let renewal = Renewal { lease: run.lease, work: 1, tiles: Vec::new() };
     assert_eq!(world.farm.on_renew(worker, &[renewal], world.now), Ok(vec![run.lease]));
-    assert!(world.farm.on_cancel(job).is_empty(), "there is no such job");
+    assert!(world.farm.on_cancel(job, world.now).is_empty(), "there is no such job");
 }
 
 #[test]
-fn the_last_jobs_to_end_are_kept() {
+fn jobs_that_ended_are_kept_until_they_are_too_old_or_too_large_together() {
+    let mut world = World::new();
+    world.farm.keep(Keeping { time: SECOND * 100, byte_count: 25 });
+    let end = |world: &mut World, byte_count| {
+        let job = world.submit_with(1, Terms { byte_count, ..Terms::default() });
+        let worker = world.join();
+        let run = world.lease(worker);
+        (job, forgotten(&world.stitch(worker, &run)))
+    };
+    let (first, gone) = end(&mut world, 10);
+    assert_eq!(gone, []);
+    world.pass(SECOND);
+    let (second, gone) = end(&mut world, 10);
+    assert_eq!(gone, []);
+    let left = |world: &World| -> Vec<Duration> {
+        let entries = world.farm.job_entries(world.now).into_iter();
+        entries.filter_map(|entry| entry.expires_in).collect()
+    };
+    assert_eq!(left(&world), [SECOND * 99, SECOND * 100]);
+    let (third, gone) = end(&mut world, 10);
+    assert_eq!(gone, [first], "the first that ended");
+    let (large, gone) = end(&mut world, 1000);
+    assert_eq!(gone, [second, third], "what is the last to end is kept, whatever it has");
+    assert_eq!(forgotten(&world.pass(SECOND * 99)), []);
+    assert_eq!(world.farm.next_wake(), Some(world.now + SECOND));
+    assert_eq!(forgotten(&world.pass(SECOND)), [large]);
+    let (last, _) = end(&mut world, 1);
+    assert_eq!(forgotten(&world.farm.on_cancel(last, world.now)), [last], "fetched or not wanted");
+    world.farm.check();
+}
+
+#[test]
+fn a_job_of_higher_priority_goes_first_and_a_paused_one_rests() {
     let mut world = World::new();
     let worker = world.join();
-    let waiting = world.submit(1).0;
-    let first = world.lease(worker);
-    for _ in 0..KEPT_AFTER_END {
-        world.submit(1);
-        let run = world.lease(worker);
-        assert!(forgotten(&world.stitch(worker, &run)).is_empty());
+    let [low, high] =
+        [0, 1].map(|priority| world.submit_with(20, Terms { priority, ..Terms::default() }));
+    assert_eq!(world.lease(worker).lease.job, high);
+    let change = |world: &mut World, job, change| {
+        let (changed, actions) = world.farm.on_change(job, change, world.now);
+        world.farm.check();
+        (changed, actions)
+    };
+    let (changed, actions) = change(&mut world, low, Change::Priority(2));
+    assert_eq!(changed, Ok(()));
+    assert!(matches!(actions[0], Action::Keep(job, Terms { priority: 2, .. }) if job == low));
+    assert_eq!(world.lease(worker).lease.job, low);
+    for job in [low, high] {
+        assert_eq!(change(&mut world, job, Change::Pause(true)).0, Ok(()));
     }
-    let actions = world.stitch(worker, &first);
-    assert_eq!(forgotten(&actions), [JobId(waiting.0 + 1)], "the first that ended");
-    assert_eq!(forgotten(&world.farm.on_cancel(waiting)), [waiting], "fetched or not wanted");
+    let other = world.join();
+    let (ask, actions) = world.ask(other, SECOND * 9);
+    assert!(answers(&actions).is_empty(), "nor is anything rendered a second time");
+    assert!(answers(&world.pass(SECOND)).is_empty());
+    let phases = |world: &World| -> Vec<(JobId, JobPhase)> {
+        world.farm.job_entries(world.now).iter().map(|entry| (entry.id, entry.phase)).collect()
+    };
+    assert_eq!(phases(&world), [(low, JobPhase::Paused), (high, JobPhase::Paused)]);
+    let (_, actions) = change(&mut world, high, Change::Pause(false));
+    let [(answered, Ok(Next::Render(run)))] = &answers(&actions)[..] else { panic!("{actions:?}") };
+    assert_eq!((*answered, run.lease.job), (ask, high));
+    assert_eq!(phases(&world), [(low, JobPhase::Paused), (high, JobPhase::Rendering)]);
+    assert_eq!(change(&mut world, JobId(99), Change::Pause(true)).0, Err(Refused::Unknown));
+    world.farm.on_store_failed(high, "the disk is full".to_owned(), world.now);
+    assert_eq!(change(&mut world, high, Change::Priority(1)).0, Err(Refused::Ended));
+    assert_eq!(change(&mut world, low, Change::Retry).0, Err(Refused::NotFailed));
+}
+
+#[test]
+fn so_many_workers_render_a_job_and_no_more() {
+    let mut world = World::new();
+    let [first, second] = [world.join(), world.join()];
+    let narrow = world.submit_with(40, Terms { most_workers: Some(1), ..Terms::default() });
+    let wide = world.submit(40).0;
+    let runs = [first, first, second].map(|worker| world.lease(worker));
+    assert_eq!(runs.map(|run| run.lease.job), [narrow, narrow, wide]);
+    world.farm.on_leave(first, "it is tired", world.now);
+    assert_eq!(world.lease(second).lease.job, narrow, "there is room again");
+}
+
+#[test]
+fn what_failed_is_tried_again_and_nothing_else() {
+    let mut world = World::with_audit(0.0);
+    let worker = world.join();
+    let (job, _) = world.submit(3);
+    let [run, open] = [(); 2].map(|()| world.lease(worker));
+    world.stitch(worker, &run);
+    world.farm.on_store_failed(job, "the disk is full".to_owned(), world.now);
+    world.pass(SECOND);
+    let (retried, actions) = world.farm.on_change(job, Change::Retry, world.now);
     world.farm.check();
+    assert_eq!(retried, Ok(()));
+    assert!(matches!(actions[0], Action::Reopen(reopened) if reopened == job));
+    let now = shown(&actions);
+    assert_eq!((now.tiles_done, now.retry_count, now.outcome), (1, 1, None));
+    let late = world.deliver(worker, &open, 7);
+    assert_eq!(verdicts(&late.1), [(late.0, Verdict::Rejected)], "its lease ended with the job");
+    let mut rendered = Vec::new();
+    let mut last = Vec::new();
+    while rendered.len() < 2 {
+        let rest = world.lease(worker);
+        for &tile in &rest.tiles {
+            rendered.push(tile);
+            last = world.stitch(worker, &Run { tiles: vec![tile], ..rest.clone() });
+        }
+    }
+    assert!(rendered[0] != rendered[1] && !rendered.contains(&run.tiles[0]), "{rendered:?}");
+    assert_eq!(shown(&last).outcome, Some(Outcome::Finished(Duration::ZERO)));
+}
+
+#[test]
+fn a_job_that_failed_under_an_earlier_start_is_tried_again_when_its_tiles_are_known() {
+    let mut world = World::new();
+    let failed = Progress {
+        outcome: Some(Outcome::Failed("no luck".to_owned())),
+        tile_count: 2,
+        ..Progress::default()
+    };
+    let grid = TileGrid::new(Size::new(32, 16).unwrap(), 16).unwrap();
+    let foreign = Terms { is_foreign: true, ..Terms::default() };
+    for (number, terms) in [(1, Terms::default()), (2, foreign)] {
+        let age = (SECOND, world.now);
+        world.farm.on_kept(JobId(number), failed.clone(), terms, age);
+    }
+    let retry = |world: &mut World, job, known| {
+        let answer = world.farm.on_retry(JobId(job), known, world.now).0;
+        world.farm.check();
+        answer
+    };
+    assert_eq!(retry(&mut world, 2, None), Err(Refused::Foreign));
+    assert_eq!(retry(&mut world, 1, None), Err(Refused::TilesUnknown));
+    let mut tiles = Tiles::new(grid);
+    tiles.set_done(grid.tile(0).unwrap(), [7; 32]);
+    assert_eq!(retry(&mut world, 1, Some((tiles, Earlier::default()))), Ok(()));
+    let worker = world.join();
+    assert_eq!(world.lease(worker).tiles, [grid.tile(1).unwrap()]);
+}
+
+#[test]
+fn a_drained_worker_brings_what_it_has_and_goes_home_and_a_disabled_one_gets_nothing() {
+    let mut world = World::new();
+    let [drained, disabled] = [world.join(), world.join()];
+    world.submit(9);
+    let run = world.lease(drained);
+    let station = |world: &mut World, worker, standing| {
+        let (known, actions) = world.farm.on_station(worker, standing, world.now);
+        world.farm.check();
+        known.map(|()| actions)
+    };
+    station(&mut world, disabled, Standing::Disabled).unwrap();
+    let (asked, actions) = world.ask(disabled, SECOND * 99);
+    assert!(answers(&actions).is_empty());
+    station(&mut world, drained, Standing::Draining).unwrap();
+    let (last, actions) = world.ask(drained, SECOND * 99);
+    assert!(answers(&actions).is_empty(), "it has tiles still");
+    let mut sent = Vec::new();
+    for &tile in &run.tiles {
+        let run = Run { tiles: vec![tile], ..run.clone() };
+        let (_, actions) = world.deliver(drained, &run, 7);
+        sent.extend(answers(&actions));
+        world.store(&run);
+    }
+    assert_eq!(sent, [(last, Ok(Next::GoHome))]);
+    assert_eq!(station(&mut world, drained, Standing::Active).unwrap_err(), NoMember(drained));
+    let [(entry, 0)] = &world.farm.worker_entries(world.now)[..] else { panic!("one is left") };
+    assert_eq!((entry.worker, entry.standing), (disabled, Standing::Disabled));
+    let actions = station(&mut world, disabled, Standing::Active).unwrap();
+    assert!(matches!(answers(&actions)[..], [(id, Ok(Next::Render(_)))] if id == asked));
+}
+
+#[test]
+fn a_job_whose_client_goes_untold_ends_unless_another_was_told() {
+    for is_claimed in [false, true] {
+        let mut world = World::new();
+        let (job, _) = world.submit(1);
+        if is_claimed {
+            world.farm.on_claim(job);
+        }
+        let actions = world.farm.on_abandon(job, world.now);
+        assert_eq!(forgotten(&actions).is_empty(), is_claimed);
+        world.farm.check();
+    }
 }
 
 #[test]
@@ -775,7 +952,13 @@ fn a_farm_that_keeps_its_jobs_goes_on_with_them() {
         tally: Tally { rays: 30, ..Tally::default() },
         worker_count: 2,
     };
-    let actions = world.farm.on_order(JobId(3), done(&[0, 1, 3]), earlier.clone(), world.now);
+    let actions = world.farm.on_order(
+        JobId(3),
+        done(&[0, 1, 3]),
+        earlier.clone(),
+        Terms::default(),
+        world.now,
+    );
     world.farm.check();
     assert_eq!((shown(&actions).tiles_done, shown(&actions).tally.rays), (3, 30));
     let worker = world.join();
@@ -786,11 +969,13 @@ fn a_farm_that_keeps_its_jobs_goes_on_with_them() {
     assert_eq!(progress.outcome, Some(Outcome::Finished(10 * SECOND)));
     assert_eq!((progress.tally.rays, progress.worker_count), (40, 2));
 
-    let whole = world.farm.on_order(JobId(4), done(&[0, 1, 2, 3]), earlier, world.now);
+    let whole =
+        world.farm.on_order(JobId(4), done(&[0, 1, 2, 3]), earlier, Terms::default(), world.now);
     world.farm.check();
     assert_eq!(shown(&whole).outcome, Some(Outcome::Finished(9 * SECOND)));
     assert_eq!(world.farm.number_job(), JobId(6));
-    let actions = world.farm.on_kept(JobId(1), progress, world.now);
+    let actions =
+        world.farm.on_kept(JobId(1), progress, Terms::default(), (Duration::ZERO, world.now));
     world.farm.check();
     assert!(shown(&actions).outcome.is_some());
     let (job, _) = world.submit(2);

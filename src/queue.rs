@@ -1,0 +1,381 @@
+//! What people ask of a farm's queue: lists of its jobs and workers, and changes to them. An answer
+//! is a table or a line for people, or one JSON document.
+
+use std::{
+    io::{self, Write},
+    time::Duration,
+};
+
+use anyhow::{Context, anyhow};
+use rtfarm_core::{render::Tally, tile::Size};
+use rtfarm_job::Progress;
+use rtfarm_proto::{
+    Address,
+    wire::{self, Standing, control_request::Change, event, jobs_client::JobsClient},
+};
+use serde_json::{Value, json};
+use tokio::time::timeout;
+use tokio_util::sync::CancellationToken;
+use tonic::{Status, transport::Channel};
+
+use crate::{
+    args::{FarmArgs, JobArgs},
+    console::Console,
+    failure::Failure,
+    plain::plain,
+    submit::reach,
+};
+
+/// The longest that a coordinator may take to answer.
+const DEADLINE: Duration = Duration::from_secs(15);
+
+/// What is asked of a farm.
+#[derive(Debug)]
+pub(crate) enum Wish {
+    Jobs,
+    Workers,
+    Cancel(u64),
+    Change(u64, Change),
+    Station(u32, Standing),
+}
+
+/// Asks, and tells the answer.
+pub(crate) async fn run(
+    args: FarmArgs,
+    wish: Wish,
+    stop: &CancellationToken,
+) -> Result<(), Failure> {
+    let asked = async {
+        let client = connect(&args.coordinator).await?;
+        timeout(DEADLINE, ask(client, wish)).await.map_err(late)?
+    };
+    let answer = tokio::select! {
+        answer = asked => answer?,
+        () = stop.cancelled() => return Err(Failure::Interrupted),
+    };
+    answer.tell(args.json)
+}
+
+/// An answer, for machines and for people.
+#[derive(Debug)]
+struct Answer {
+    json: Value,
+    text: String,
+}
+
+impl Answer {
+    fn tell(&self, as_json: bool) -> Result<(), Failure> {
+        tell(as_json, &self.json, &self.text)
+    }
+}
+
+/// Writes one JSON document, or a text without control characters.
+pub(crate) fn tell(as_json: bool, json: &Value, text: &str) -> Result<(), Failure> {
+    let mut output = io::stdout().lock();
+    let told = if as_json {
+        writeln!(output, "{json:#}")
+    } else {
+        writeln!(output, "{}", plain(text).trim_end())
+    };
+    Ok(told.context("cannot write to standard output")?)
+}
+
+/// Reaches the coordinator.
+pub(crate) async fn connect(address: &Address) -> anyhow::Result<JobsClient<Channel>> {
+    let client = timeout(DEADLINE, reach(address)).await.map_err(late)?;
+    client.with_context(|| format!("no coordinator answers at {address}"))
+}
+
+pub(crate) fn late(_: tokio::time::error::Elapsed) -> anyhow::Error {
+    anyhow!("the coordinator does not answer")
+}
+
+#[expect(clippy::needless_pass_by_value, reason = "`map_err` hands it over")]
+pub(crate) fn refused(status: Status) -> anyhow::Error {
+    anyhow!("the coordinator says: {}", plain(status.message()))
+}
+
+async fn ask(mut client: JobsClient<Channel>, wish: Wish) -> anyhow::Result<Answer> {
+    Ok(match wish {
+        Wish::Jobs => {
+            let list = client.list(wire::ListRequest {}).await.map_err(refused)?;
+            list_jobs(&list.into_inner().jobs)
+        }
+        Wish::Workers => {
+            let list = client.workers(wire::WorkersRequest {}).await.map_err(refused)?;
+            list_workers(&list.into_inner().workers)
+        }
+        Wish::Cancel(job) => {
+            let request = wire::CancelRequest { job, ..wire::CancelRequest::default() };
+            let cancelled = client.cancel(request).await.map_err(refused)?.into_inner();
+            if !cancelled.was_known {
+                return Err(anyhow!("the coordinator says: there is no such job"));
+            }
+            done(&[("job", job.to_string().into())], format!("job {job} is cancelled"))
+        }
+        Wish::Change(job, change) => {
+            let (key, value, text) = match change {
+                Change::Paused(true) => ("paused", true.into(), "is paused".to_owned()),
+                Change::Paused(false) => ("paused", false.into(), "goes on".to_owned()),
+                Change::Priority(n) => ("priority", n.into(), format!("has priority {n}")),
+                Change::Retry(_) => ("retried", true.into(), "is tried again".to_owned()),
+            };
+            let change = Some(change);
+            let request = wire::ControlRequest { job, change, ..wire::ControlRequest::default() };
+            client.control(request).await.map_err(refused)?;
+            done(&[("job", job.to_string().into()), (key, value)], format!("job {job} {text}"))
+        }
+        Wish::Station(worker, standing) => {
+            let request = wire::StationRequest { worker, standing: standing.into() };
+            let answer = client.station(request).await.map_err(refused)?.into_inner();
+            if !answer.was_known {
+                return Err(anyhow!("the coordinator says: there is no such worker"));
+            }
+            let standing = standing_name(standing);
+            let json = [("worker", worker.into()), ("standing", standing.into())];
+            done(&json, format!("worker {worker} is {standing}"))
+        }
+    })
+}
+
+fn done(fields: &[(&str, Value)], text: String) -> Answer {
+    let fields = fields.iter().map(|(key, value)| ((*key).to_owned(), value.clone()));
+    Answer { json: Value::Object(fields.collect()), text }
+}
+
+fn list_jobs(jobs: &[wire::JobEntry]) -> Answer {
+    let head =
+        ["JOB", "STATE", "TILES", "WORKERS", "PRIORITY", "TIME", "OWNER", "SIZE", "KEPT", "NAME"];
+    let rows = jobs.iter().map(|job| {
+        let wire::Event { tiles_done, tile_count, .. } = job.progress.clone().unwrap_or_default();
+        let wire::Frame { width, height } = job.frame.unwrap_or_default();
+        vec![
+            job.job.to_string(),
+            state_name(job.state()).to_owned(),
+            format!("{tiles_done}/{tile_count}"),
+            most_of(job.workers_now, job.max_workers),
+            job.priority.to_string(),
+            format!("{:.1}s", job.seconds),
+            job.owner.clone(),
+            format!("{width}x{height}"),
+            if has_ended(job) {
+                format!("{:.1}h", job.expires_in / 3600.0)
+            } else {
+                "-".to_owned()
+            },
+            job.name.clone(),
+        ]
+    });
+    Answer {
+        json: Value::Array(jobs.iter().map(job_json).collect()),
+        text: table(&head, rows.collect()),
+    }
+}
+
+fn most_of(now: u32, most: u32) -> String {
+    if most == 0 { now.to_string() } else { format!("{now} of {most}") }
+}
+
+fn has_ended(job: &wire::JobEntry) -> bool {
+    matches!(job.state(), wire::JobState::Finished | wire::JobState::Failed)
+}
+
+/// Numbers of jobs have 64 bits, for which many readers of JSON have no room: they are strings.
+fn job_json(job: &wire::JobEntry) -> Value {
+    let wire::Frame { width, height } = job.frame.unwrap_or_default();
+    let mut value = json!({
+        "job": job.job.to_string(),
+        "name": job.name,
+        "owner": job.owner,
+        "state": state_name(job.state()),
+        "priority": job.priority,
+        "workers_now": job.workers_now,
+        "max_workers": (job.max_workers > 0).then_some(job.max_workers),
+        "width": width,
+        "height": height,
+        "seconds": job.seconds,
+        "bytes": job.bytes,
+        "expires_in_seconds": has_ended(job).then_some(job.expires_in),
+    });
+    let progress = progress_json(&job.progress.clone().unwrap_or_default());
+    if let (Value::Object(value), Value::Object(progress)) = (&mut value, progress) {
+        value.extend(progress);
+    }
+    value
+}
+
+fn progress_json(event: &wire::Event) -> Value {
+    let reason = match &event.end {
+        Some(event::End::Failed(reason)) => Some(reason),
+        _ => None,
+    };
+    json!({
+        "tiles_done": event.tiles_done,
+        "tile_count": event.tile_count,
+        "workers": event.workers,
+        "differing_tiles": event.differing_tiles,
+        "failure": reason,
+    })
+}
+
+fn list_workers(workers: &[wire::WorkerEntry]) -> Answer {
+    let head =
+        ["WORKER", "STANDING", "TILES", "DONE", "THREADS", "ISA", "SILENT", "PROCESS", "HOST"];
+    let rows = workers.iter().map(|worker| {
+        vec![
+            worker.worker.to_string(),
+            standing_name(worker.standing()).to_owned(),
+            worker.tiles_leased.to_string(),
+            worker.tiles_done.to_string(),
+            worker.threads.to_string(),
+            worker.isa.clone(),
+            format!("{:.1}s", worker.silence),
+            worker.process.to_string(),
+            worker.host.clone(),
+        ]
+    });
+    let worker_json = |worker: &wire::WorkerEntry| {
+        json!({
+            "worker": worker.worker,
+            "standing": standing_name(worker.standing()),
+            "tiles_leased": worker.tiles_leased,
+            "tiles_done": worker.tiles_done,
+            "threads": worker.threads,
+            "isa": worker.isa,
+            "silent_seconds": worker.silence,
+            "process": worker.process,
+            "host": worker.host,
+        })
+    };
+    Answer {
+        json: Value::Array(workers.iter().map(worker_json).collect()),
+        text: table(&head, rows.collect()),
+    }
+}
+
+fn state_name(state: wire::JobState) -> &'static str {
+    match state {
+        wire::JobState::Unspecified => "unknown",
+        wire::JobState::Waiting => "waiting",
+        wire::JobState::Rendering => "rendering",
+        wire::JobState::Paused => "paused",
+        wire::JobState::Finished => "finished",
+        wire::JobState::Failed => "failed",
+    }
+}
+
+fn standing_name(standing: Standing) -> &'static str {
+    match standing {
+        Standing::Unspecified => "unknown",
+        Standing::Active => "active",
+        Standing::Draining => "draining",
+        Standing::Disabled => "disabled",
+    }
+}
+
+/// A line for each row under a heading, cells of a column under each other; lines in a cell become
+/// one.
+fn table(head: &[&str], rows: Vec<Vec<String>>) -> String {
+    let head = head.iter().map(|&name| name.to_owned()).collect();
+    let clean = |cell: &String| plain(cell).split_whitespace().collect::<Vec<_>>().join(" ");
+    let rows: Vec<Vec<String>> = std::iter::once(head)
+        .chain(rows)
+        .map(|row: Vec<String>| row.iter().map(clean).collect())
+        .collect();
+    let width = |column: usize| rows.iter().map(|row| row[column].chars().count()).max();
+    let mut text = String::new();
+    for row in &rows {
+        let cells = row.iter().enumerate();
+        let cells = cells.map(|(k, cell)| format!("{cell:0$}", width(k).unwrap_or(0)));
+        text.push_str(cells.collect::<Vec<_>>().join("  ").trim_end());
+        text.push('\n');
+    }
+    text
+}
+
+/// `rtfarm watch`: shows how far a job is until it has ended.
+pub(crate) async fn watch(
+    args: JobArgs,
+    console: &Console,
+    stop: &CancellationToken,
+) -> Result<(), Failure> {
+    let last = tokio::select! {
+        last = follow(&args, console) => last?,
+        () = stop.cancelled() => return Err(Failure::Interrupted),
+    };
+    let mut json = progress_json(&last);
+    json["job"] = args.job.to_string().into();
+    match last.end {
+        Some(event::End::Finished(wire::Finished { seconds })) => {
+            json["state"] = "finished".into();
+            json["seconds"] = seconds.into();
+            tell(args.farm.json, &json, &format!("job {} finished in {seconds:.2} s", args.job))
+        }
+        Some(event::End::Failed(reason)) => {
+            json["state"] = "failed".into();
+            if args.farm.json {
+                tell(true, &json, "")?;
+            }
+            Err(anyhow!("the job failed: {}", plain(&reason)).into())
+        }
+        None => Err(anyhow!("the coordinator is gone").into()),
+    }
+}
+
+/// Shows what the coordinator tells of a job; answers with the last of it.
+async fn follow(args: &JobArgs, console: &Console) -> anyhow::Result<wire::Event> {
+    let mut client = connect(&args.farm.coordinator).await?;
+    let request = wire::WatchRequest { job: args.job, ..wire::WatchRequest::default() };
+    let events = timeout(DEADLINE, client.watch(request)).await.map_err(late)?;
+    let mut events = events.map_err(refused)?.into_inner();
+    let mut last = wire::Event::default();
+    let mut bar = None;
+    while let Some(event) = events.message().await.map_err(refused)? {
+        let Some(tally) = event.tally.and_then(|tally| Tally::try_from(tally).ok()) else {
+            return Err(anyhow!("the coordinator's answer makes no sense"));
+        };
+        bar.get_or_insert_with(|| console.start_bar(event.tile_count)).show(&Progress {
+            tiles_done: event.tiles_done,
+            tile_count: event.tile_count,
+            tally,
+            ..Progress::default()
+        });
+        last = event;
+    }
+    Ok(last)
+}
+
+/// What there is to say of a picture that was fetched.
+pub(crate) fn picture_json(job: u64, path: &std::path::Path, size: Option<Size>) -> Value {
+    json!({
+        "job": job.to_string(),
+        "picture": path.display().to_string(),
+        "width": size.map(Size::width),
+        "height": size.map(Size::height),
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_table_has_a_line_a_row_and_its_columns_are_aligned() {
+        let row = |cells: [&str; 3]| cells.map(str::to_owned).to_vec();
+        let rows = vec![row(["7", "two\nlines \x1b[2J", "x"]), row(["1234", "", "yz"])];
+        let text = table(&["JOB", "NAME", "N"], rows);
+        let expected = "JOB   NAME           N\n7     two lines [2J  x\n1234                 yz\n";
+        assert_eq!(text, expected);
+    }
+
+    #[test]
+    fn a_jobs_number_keeps_its_64_bits_in_json() {
+        let entry = wire::JobEntry { job: u64::MAX, ..wire::JobEntry::default() };
+        let Answer { json, text } = list_jobs(&[entry]);
+        assert_eq!(json[0]["job"], "18446744073709551615");
+        assert!(
+            text.lines().nth(1).unwrap().starts_with("18446744073709551615  unknown"),
+            "{text}"
+        );
+    }
+}

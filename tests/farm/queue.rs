@@ -1,0 +1,166 @@
+//! A farm's queue, as people use it.
+
+use serde_json::Value;
+
+use super::*;
+
+/// A farm that keeps its state, started; and its address.
+fn start_farm(place: &Place, listen: &str) -> (Process, String) {
+    let args = ["coordinator", "--listen", listen, "--state", "state", "--lease-seconds", "0.5"];
+    let mut coordinator = place.start("coordinator.log", &args);
+    let line = coordinator.read_line();
+    let url = line.trim().strip_prefix("listening on ").expect(&line).to_owned();
+    (coordinator, url)
+}
+
+/// Runs a command to its end; answers with its exit code, what it printed and what it logged.
+fn ask(place: &Place, url: &str, words: &[&str]) -> (Option<i32>, String, String) {
+    let mut process = place.start("ask.log", &[words, &["--coordinator", url]].concat());
+    let mut lines = String::new();
+    loop {
+        let line = process.read_line();
+        if line.is_empty() {
+            break;
+        }
+        lines.push_str(&line);
+    }
+    (process.wait().code(), lines, process.log())
+}
+
+/// Runs a command that answers in JSON to its good end.
+fn json(place: &Place, url: &str, words: &[&str]) -> Value {
+    let (code, answer, log) = ask(place, url, &[words, &["--json"]].concat());
+    assert_eq!(code, Some(0), "{words:?}: {log}");
+    serde_json::from_str(&answer).expect(&answer)
+}
+
+/// Submits a picture that goes on by itself; answers with its job's number.
+fn detach(place: &Place, url: &str, words: &[&str]) -> String {
+    let submit = ["submit", "scene.rt", "-o", "out.png", "--detach"];
+    let (code, number, log) = ask(place, url, &[&submit, words].concat());
+    assert_eq!(code, Some(0), "{log}");
+    number.trim().to_owned()
+}
+
+/// What the list says of a job.
+fn entry(place: &Place, url: &str, job: &str) -> Value {
+    let jobs = json(place, url, &["jobs"]);
+    let found = jobs.as_array().unwrap().iter().find(|entry| entry["job"] == *job);
+    found.unwrap_or_else(|| panic!("{job} in {jobs}")).clone()
+}
+
+/// The numbers of the jobs in the order of the list.
+fn order(place: &Place, url: &str) -> Vec<String> {
+    let jobs = json(place, url, &["jobs"]);
+    let numbers = jobs.as_array().unwrap().iter();
+    numbers.map(|entry| entry["job"].as_str().unwrap().to_owned()).collect()
+}
+
+#[test]
+fn people_can_live_with_the_queue() {
+    let place = Place::new();
+    let (mut coordinator, mut url) = start_farm(&place, "127.0.0.1:0");
+
+    // Two jobs that nobody renders yet, one of them ordered twice under a key.
+    let named = ["--name", "my picture", "--owner", "anna", "--max-workers", "2"];
+    let first = detach(&place, &url, &[&SLOW[..], &named].concat());
+    let second = detach(&place, &url, &[&SLOW[..], &["--key", "a key"]].concat());
+    assert_eq!(detach(&place, &url, &[&SLOW[..], &["--key", "a key"]].concat()), second);
+    assert_eq!(order(&place, &url), [&first[..], &second]);
+    let of_first = entry(&place, &url, &first);
+    assert_eq!(of_first["name"], "my picture");
+    assert_eq!(of_first["owner"], "anna");
+    assert_eq!(of_first["max_workers"], 2);
+    assert_eq!(of_first["state"], "waiting");
+    let table = ask(&place, &url, &["jobs"]).1;
+    assert_eq!(table.lines().count(), 3, "{table}");
+
+    assert_eq!(json(&place, &url, &["priority", &second, "5"])["priority"], 5);
+    assert_eq!(order(&place, &url), [&second[..], &first]);
+    assert_eq!(json(&place, &url, &["pause", &second])["paused"], true);
+
+    // All of it outlives the coordinator.
+    coordinator.signal(Signal::KILL);
+    coordinator.wait();
+    (coordinator, url) = start_farm(&place, url.strip_prefix("http://").unwrap());
+    assert_eq!(order(&place, &url), [&second[..], &first]);
+    let of_second = entry(&place, &url, &second);
+    assert_eq!((&of_second["state"], &of_second["priority"]), (&"paused".into(), &5.into()));
+    assert_eq!(entry(&place, &url, &first)["name"], "my picture");
+    assert_eq!(detach(&place, &url, &[&SLOW[..], &["--key", "a key"]].concat()), second);
+
+    // The paused one rests though it comes first; what there is of the other can be seen.
+    let start = |log: &str| place.start(log, &["worker", "--threads", "1", "--coordinator", &url]);
+    let mut worker = start("worker.log");
+    poll(|| (entry(&place, &url, &first)["tiles_done"].as_u64() >= Some(3)).then_some(()));
+    assert_eq!(entry(&place, &url, &second)["tiles_done"], 0);
+    let (code, _, log) = ask(&place, &url, &["image", &first, "-o", "early.png"]);
+    assert_eq!(code, Some(1));
+    assert!(log.contains("the job has not finished"), "{log}");
+    json(&place, &url, &["image", &first, "-o", "early.png", "--partial"]);
+    let early = image::open(place.path("early.png")).unwrap();
+    assert_eq!((early.width(), early.height()), (320, 240));
+    json(&place, &url, &["cancel", &first]);
+    assert_eq!(order(&place, &url), [&second[..]]);
+    for unknown in [&["cancel", &first[..]][..], &["pause", &first], &["watch", &first]] {
+        let (code, _, log) = ask(&place, &url, unknown);
+        assert_eq!(code, Some(1), "{unknown:?}");
+        assert!(log.contains("there is no such job"), "{log}");
+    }
+
+    json(&place, &url, &["resume", &second]);
+    poll(|| (entry(&place, &url, &second)["tiles_done"].as_u64() > Some(0)).then_some(()));
+    let workers = json(&place, &url, &["workers"]);
+    let number = workers[0]["worker"].to_string();
+    assert_eq!(json(&place, &url, &["drain", &number])["standing"], "draining");
+    assert!(worker.wait().success(), "{}", worker.log());
+    assert_eq!(json(&place, &url, &["workers"]), Value::Array(Vec::new()));
+    json(&place, &url, &["cancel", &second]);
+
+    // A worker that is disabled gets nothing, until it is enabled.
+    let small = ["--size", "64x48", "--samples", "2"];
+    let mut worker = start("worker.log");
+    let number = poll(|| {
+        let workers = json(&place, &url, &["workers"]);
+        workers.get(0).map(|worker| worker["worker"].to_string())
+    });
+    json(&place, &url, &["disable", &number]);
+    let third = detach(&place, &url, &small);
+    thread::sleep(Duration::from_millis(300));
+    assert_eq!(entry(&place, &url, &third)["state"], "waiting");
+    json(&place, &url, &["enable", &number]);
+    assert_eq!(json(&place, &url, &["watch", &third])["state"], "finished");
+    let here = place.render("here.png", &[&small[..], &["--workers", "0"]].concat());
+    json(&place, &url, &["image", &third, "-o", "kept.png", "--keep"]);
+    json(&place, &url, &["image", &third, "-o", "out.png"]);
+    assert!(fs::read(place.path("out.png")).unwrap() == here);
+    assert!(fs::read(place.path("kept.png")).unwrap() == here);
+    assert!(order(&place, &url).is_empty(), "it was fetched");
+    worker.signal(Signal::TERM);
+    worker.wait();
+
+    // A tile ends three workers, and its job with them; then it is tried again.
+    let one_tile = ["--size", "48x48", "--tile", "48", "--samples", "2048"];
+    let fourth = detach(&place, &url, &one_tile);
+    for _ in 0..3 {
+        let worker = start("worker.log");
+        poll(|| (entry(&place, &url, &fourth)["workers_now"] == 1).then_some(()));
+        worker.signal(Signal::KILL);
+        poll(|| (entry(&place, &url, &fourth)["workers_now"] == 0).then_some(()));
+    }
+    let (code, _, log) = ask(&place, &url, &["watch", &fourth]);
+    assert_eq!(code, Some(1));
+    assert!(log.contains("the job failed: 0 of 1 tiles are right; set aside"), "{log}");
+    coordinator.signal(Signal::TERM);
+    assert!(coordinator.wait().success());
+    (coordinator, url) = start_farm(&place, url.strip_prefix("http://").unwrap());
+    assert_eq!(entry(&place, &url, &fourth)["state"], "failed");
+    json(&place, &url, &["retry", &fourth]);
+    let _worker = place.start("worker.log", &["worker", "--threads", "1", "--coordinator", &url]);
+    assert_eq!(json(&place, &url, &["watch", &fourth])["state"], "finished");
+    json(&place, &url, &["image", &fourth, "-o", "out.png"]);
+    let here = place.render("here.png", &[&one_tile[..], &["--workers", "0"]].concat());
+    assert!(fs::read(place.path("out.png")).unwrap() == here);
+    coordinator.signal(Signal::TERM);
+    coordinator.wait();
+}
