@@ -15,7 +15,7 @@ use std::{
     time::Duration,
 };
 
-use rtfarm_coordinator::{Config, Coordinator, Listener, listen};
+use rtfarm_coordinator::{Config, Coordinator, Keeping, Listener, listen};
 use rtfarm_core::{
     render::{Quality, Sampling},
     tile::{Size, TileGrid},
@@ -75,6 +75,7 @@ async fn run(load: Load, folder: PathBuf) -> Result<(), Error> {
         build: VERSION.to_owned(),
         reference: None,
         audit: 0.0,
+        keeping: Keeping::default(),
         term: Duration::from_secs(60),
         upload_silence: Duration::from_secs(30),
         scene_folder: scenes.path().to_owned(),
