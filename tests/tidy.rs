@@ -299,6 +299,7 @@ fn files_of_the_coordinator_know_only_earlier_ones() {
         "restart",
         "whole_farm",
         "farm/tests",
+        "farm/queue",
         "farm/trust",
     ];
     assert_eq!(rust_files("coordinator/src").len(), COORDINATOR.len() + others.len());
