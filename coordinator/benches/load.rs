@@ -75,7 +75,6 @@ async fn run(load: Load, folder: PathBuf) -> Result<(), Error> {
         build: VERSION.to_owned(),
         reference: None,
         audit: 0.0,
-        keeping: Keeping::default(),
         term: Duration::from_secs(60),
         upload_silence: Duration::from_secs(30),
         scene_folder: scenes.path().to_owned(),
