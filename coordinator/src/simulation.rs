@@ -38,10 +38,10 @@ const RESTARTS: u32 = 2;
 const STEPS: usize = 100_000;
 
 /// Steele, Lea & Flood, "Fast Splittable Pseudorandom Number Generators" (2014).
-struct SplitMix64(u64);
+pub(crate) struct SplitMix64(pub(crate) u64);
 
 impl SplitMix64 {
-    fn below(&mut self, end: u64) -> u64 {
+    pub(crate) fn below(&mut self, end: u64) -> u64 {
         self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
         let mut z = self.0;
         z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);

@@ -55,6 +55,7 @@ use crate::{
     identity::Identity,
     service::{FarmService, JobsService, services},
     shell::Shell,
+    simulation::SplitMix64,
     state::{Durability, StateFolder},
 };
 
@@ -120,19 +121,6 @@ fn expected(number: usize) -> &'static [u8] {
         file.into_inner()
     };
     &PNGS.get_or_init(|| (0..CLIENTS * PICTURES).map(render).collect())[number]
-}
-
-/// Steele, Lea & Flood, "Fast Splittable Pseudorandom Number Generators" (2014).
-struct SplitMix64(u64);
-
-impl SplitMix64 {
-    fn below(&mut self, end: u64) -> u64 {
-        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
-        let mut z = self.0;
-        z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-        (z ^ (z >> 31)) % end
-    }
 }
 
 /// What goes wrong.
