@@ -78,8 +78,16 @@ impl Summary {
         format!("error {error:.2e}{unit}{capped}")
     }
 
-    /// Writes the one line that a render ends with.
-    pub(crate) fn tell(&self, started: Instant, output: &Output) -> anyhow::Result<()> {
+    /// Writes the one line that a render ends with, unless it is quiet.
+    pub(crate) fn tell(
+        &self,
+        started: Instant,
+        output: &Output,
+        console: &Console,
+    ) -> anyhow::Result<()> {
+        if console.is_quiet() {
+            return Ok(());
+        }
         let mrays = self.tally.rays as f64 / 1e6;
         writeln!(
             io::stdout().lock(),
@@ -121,7 +129,7 @@ pub(crate) async fn run(
     if let Some(resume) = resume {
         resume.remove()?;
     }
-    summary.tell(started, &output)?;
+    summary.tell(started, &output, console)?;
     if let Some(time) = args.time {
         let over = summary.rendering.as_secs_f64() / time.as_secs_f64() - 1.0;
         tracing::info!(
