@@ -17,7 +17,7 @@ use rtfarm_ladder::Effort;
 use rtfarm_picture::PictureFormat;
 use rtfarm_proto::Address;
 
-use crate::output::Output;
+use crate::{frames::FrameRange, output::Output};
 
 /// Renders scenes in the rt language, on one machine or many.
 #[derive(Debug, Parser)]
@@ -102,7 +102,7 @@ pub(crate) enum Command {
 }
 
 /// Which scene, and how it is read.
-#[derive(Debug, ClapArgs)]
+#[derive(Debug, Clone, ClapArgs)]
 pub(crate) struct SceneArgs {
     /// The scene's file; `-` reads it from standard input.
     #[arg(value_name = "SCENE")]
@@ -181,14 +181,14 @@ pub(crate) struct ReportArgs {
 }
 
 /// What picture is wanted.
-#[derive(Debug, ClapArgs)]
+#[derive(Debug, Clone, ClapArgs)]
 pub(crate) struct PictureArgs {
     #[command(flatten)]
     pub(crate) scene: SceneArgs,
 
     /// Where the picture goes; the extension, .png or .exr, says how it is written.
     #[arg(short, long = "output", value_name = "FILE")]
-    output: PathBuf,
+    pub(crate) output: PathBuf,
 
     /// The picture's size in pixels; the size that the scene asks for by default.
     #[arg(long, value_name = "WxH", value_parser = parse_size, help_heading = PICTURE)]
@@ -246,6 +246,12 @@ pub(crate) struct PictureArgs {
 pub(crate) struct RenderArgs {
     #[command(flatten)]
     pub(crate) picture: PictureArgs,
+
+    /// Render these frames of a sequence: 1-48, or 1-48x2 for each second one. SCENE and FILE then have
+    /// a place for the number, like shot.%04d.rt. The next frame fills the workers while the last tiles
+    /// of one are rendered.
+    #[arg(long, value_name = "A-B", conflicts_with = "time")]
+    pub(crate) frames: Option<FrameRange>,
 
     /// Make the picture as good as this many seconds allow: a pilot chooses the --error and the
     /// --max-samples, and tells them.

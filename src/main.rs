@@ -6,6 +6,7 @@ mod children;
 mod console;
 mod coordinator;
 mod failure;
+mod frames;
 mod image;
 mod local;
 mod log_queue;

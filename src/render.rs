@@ -1,8 +1,9 @@
 //! `rtfarm render`: a picture from this machine alone.
 
 use std::{
+    collections::VecDeque,
     io::{self, Write},
-    sync::Arc,
+    sync::{Arc, Mutex},
     time::Duration,
 };
 
@@ -106,40 +107,303 @@ impl Summary {
     }
 }
 
+/// A picture to be rendered.
+struct Frame {
+    order: Order,
+    begun: Begun,
+    output: Output,
+    resume: Option<Resume>,
+}
+
+/// A picture under way, by those who render it.
+struct Started {
+    size: Size,
+    sampling: Sampling,
+    transfer: Transfer,
+    output: Output,
+    resume: Option<Resume>,
+    work: Work,
+}
+
+enum Work {
+    /// This process renders it when its turn comes.
+    Here(Box<(Order, Begun)>),
+    /// Workers render it.
+    Job(Arc<Job>),
+}
+
+/// A picture that is rendered and not written yet.
+struct Rendered {
+    summary: Summary,
+    output: Output,
+    resume: Option<Resume>,
+    picture: Drawn,
+}
+
+enum Drawn {
+    Here(Canvas),
+    Job(Arc<Job>),
+}
+
+impl Drawn {
+    fn picture(&self) -> &Picture {
+        match self {
+            Self::Here(canvas) => canvas.picture(),
+            Self::Job(job) => job.picture(),
+        }
+    }
+}
+
+/// The command under way.
+struct Render<'a> {
+    args: &'a RenderArgs,
+    console: &'a Console,
+    stop: &'a CancellationToken,
+    /// Who has workers render; without it this process does.
+    coordinator: Option<Coordinator>,
+    /// When the last picture was told of, or the command began.
+    told: Mutex<Instant>,
+}
+
+/// Pictures of which nothing was done yet, and where they go.
+type Wanted = VecDeque<(PictureArgs, Output)>;
+
 pub(crate) async fn run(
     args: RenderArgs,
     console: &Console,
     stop: &CancellationToken,
 ) -> Result<(), Failure> {
     let started = Instant::now();
-    let mut output = args.picture.output().map_err(Failure::Input)?;
-    output.check()?;
-    let text = SceneText::read(&args.picture.scene, stop).await?;
-    let mut order = place(&args.picture, &output, text, console, stop).await?;
-    if let Some(time) = args.time {
-        order = choose_quality(order, time, &args, stop).await?;
-    }
-    let (order, begun, resume) = begin(order, &output, args.resume).await?;
-    let summary = match args.workers_and_threads() {
-        (0, threads) => render_here(order, begun, threads, &args, &output, console, stop).await?,
-        workers => {
-            render_with_workers(order, begun, workers, &args, &output, console, stop).await?
-        }
+    let pictures = match args.frames {
+        Some(frames) => frames.pictures(&args.picture).map_err(Failure::Input)?,
+        None => vec![args.picture.clone()],
     };
-    if let Some(resume) = resume {
-        resume.remove()?;
+    let mut wanted = Wanted::with_capacity(pictures.len());
+    for picture in pictures {
+        let mut output = picture.output().map_err(Failure::Input)?;
+        output.check()?;
+        wanted.push_back((picture, output));
     }
-    summary.tell(started, &output, console)?;
-    if let Some(time) = args.time {
-        let over = summary.rendering.as_secs_f64() / time.as_secs_f64() - 1.0;
-        tracing::info!(
-            over_percent = (100.0 * over).round(),
-            "rendered in {:.2} s where {:.2} s were allowed",
-            summary.rendering.as_secs_f64(),
-            time.as_secs_f64()
-        );
+    let mut render = Render { args: &args, console, stop, coordinator: None, told: started.into() };
+    let first = render.place_next(&mut wanted).await?.expect("there is one at least");
+    match args.workers_and_threads() {
+        (0, _) => {
+            let (last, end) = render.all_but_the_last(first, wanted).await?;
+            render.write(last).await?;
+            end
+        }
+        workers => render.with_workers(workers, first, wanted).await,
     }
-    Ok(())
+}
+
+impl Render<'_> {
+    /// Reads the next scene and begins its picture, if there is one.
+    async fn place_next(&self, wanted: &mut Wanted) -> Result<Option<Frame>, Failure> {
+        let Some((picture, output)) = wanted.pop_front() else { return Ok(None) };
+        let (console, stop) = (self.console, self.stop);
+        let text = SceneText::read(&picture.scene, stop).await?;
+        let mut order = place(&picture, &output, text, console, stop).await?;
+        if let Some(time) = self.args.time {
+            order = choose_quality(order, time, self.args, stop).await?;
+        }
+        let (order, begun, resume) = begin(order, &output, self.args.resume).await?;
+        Ok(Some(Frame { order, begun, output, resume }))
+    }
+
+    /// Renders pictures one after the other: while one is rendered the last is written, and the next is
+    /// prepared and handed to the workers, who turn to it when nothing else of this one is left to do.
+    /// The last picture is not written yet. The second result says what a picture failed of that could
+    /// not be begun; those before it are rendered all the same.
+    async fn all_but_the_last(
+        &self,
+        first: Frame,
+        mut wanted: Wanted,
+    ) -> Result<(Rendered, Result<(), Failure>), Failure> {
+        let mut current = self.start(first).await?;
+        let mut unwritten = None;
+        loop {
+            let next = async {
+                match self.place_next(&mut wanted).await? {
+                    Some(next) => self.start(next).await.map(Some),
+                    None => Ok(None),
+                }
+            };
+            let write = async {
+                match unwritten.take() {
+                    Some(rendered) => self.write(rendered).await,
+                    None => Ok(()),
+                }
+            };
+            let render = async { tokio::try_join!(self.render(current), write) };
+            let (rendered, next) = tokio::join!(render, next);
+            let (rendered, ()) = rendered?;
+            current = match next {
+                Ok(Some(next)) => next,
+                Ok(None) => return Ok((rendered, Ok(()))),
+                Err(failure) => return Ok((rendered, Err(failure))),
+            };
+            unwritten = Some(rendered);
+        }
+    }
+
+    /// Hands a picture to those who render it.
+    async fn start(&self, frame: Frame) -> Result<Started, Failure> {
+        let Frame { order, begun, output, resume } = frame;
+        let (size, sampling) = (order.grid.window().size(), order.settings.quality.sampling);
+        let transfer = order.transfer;
+        let work = match self.coordinator.clone() {
+            None => Work::Here(Box::new((order, begun))),
+            Some(coordinator) => {
+                let (canvas, done) = begun;
+                let job = spawn_blocking(move || coordinator.submit_on(order, canvas, &done));
+                Work::Job(job.await??)
+            }
+        };
+        Ok(Started { size, sampling, transfer, output, resume, work })
+    }
+
+    /// Waits until a picture is rendered.
+    async fn render(&self, started: Started) -> Result<Rendered, Failure> {
+        let Started { size, sampling, transfer, output, resume, work } = started;
+        let (picture, tally, rendering) = match work {
+            Work::Here(ordered) => {
+                let (order, begun) = *ordered;
+                let (canvas, tally, rendering) = self.render_here(order, begun).await?;
+                (Drawn::Here(canvas), tally, rendering)
+            }
+            Work::Job(job) => {
+                let rendering = wait(&job, self.console).await?;
+                let tally = job.progress().borrow().tally;
+                (Drawn::Job(job), tally, rendering)
+            }
+        };
+        let workers = self.args.workers_and_threads().0;
+        let summary = Summary { size, tally, sampling, transfer, rendering, workers };
+        Ok(Rendered { summary, output, resume, picture })
+    }
+
+    /// Writes a picture and tells of it.
+    async fn write(&self, rendered: Rendered) -> Result<(), Failure> {
+        let Rendered { summary, output, resume, picture } = rendered;
+        let job = match &picture {
+            Drawn::Here(_) => None,
+            Drawn::Job(job) => Some(job.id()),
+        };
+        write_picture(&output, self.stop, picture).await?;
+        if let (Some(coordinator), Some(job)) = (&self.coordinator, job) {
+            coordinator.cancel(job);
+        }
+        if let Some(resume) = resume {
+            resume.remove()?;
+        }
+        let told =
+            std::mem::replace(&mut *self.told.lock().expect("nothing here panics"), Instant::now());
+        summary.tell(told, &output, self.console)?;
+        if let Some(time) = self.args.time {
+            let over = summary.rendering.as_secs_f64() / time.as_secs_f64() - 1.0;
+            tracing::info!(
+                over_percent = (100.0 * over).round(),
+                "rendered in {:.2} s where {:.2} s were allowed",
+                summary.rendering.as_secs_f64(),
+                time.as_secs_f64()
+            );
+        }
+        Ok(())
+    }
+
+    async fn render_here(
+        &self,
+        order: Order,
+        (canvas, done): Begun,
+    ) -> Result<(Canvas, Tally, Duration), Failure> {
+        let (_, threads) = self.args.workers_and_threads();
+        let tile_count = order.grid.count();
+        let progress = watch::Sender::new(Progress { tile_count, ..Progress::default() });
+        let mut shown = progress.subscribe();
+        let bar = self.console.start_bar(tile_count);
+        let rendering = spawn_blocking({
+            let (isa, stop) = (self.args.isa.0, self.stop.clone());
+            move || {
+                let rendered =
+                    local::render(order, canvas, &done, (threads, isa), &progress, &stop);
+                let tally = progress.borrow().tally;
+                rendered.map(|rendered| (rendered, tally))
+            }
+        });
+        let show = async {
+            while shown.changed().await.is_ok() {
+                bar.show(&shown.borrow_and_update());
+            }
+        };
+        let (rendered, ()) = tokio::join!(rendering, show);
+        drop(bar);
+        let (Some((canvas, rendering)), tally) = rendered?? else {
+            return Err(Failure::Interrupted);
+        };
+        Ok((canvas, tally, rendering))
+    }
+
+    /// Renders all pictures by local workers.
+    async fn with_workers(
+        &mut self,
+        (workers, threads): (usize, usize),
+        first: Frame,
+        wanted: Wanted,
+    ) -> Result<(), Failure> {
+        let folder = PrivateFolder::new(&std::env::temp_dir())?;
+        let socket = folder.path().join("socket");
+        let listener = UnixListener::bind(&socket)
+            .with_context(|| format!("cannot listen on {}", socket.display()))?;
+        let coordinator = Coordinator::new(Config {
+            version: VERSION.to_owned(),
+            build: BUILD.to_owned(),
+            // The workers are this very program on this machine: nobody here has a reason to lie.
+            reference: None,
+            term: self.args.lease_seconds,
+            audit: 0.0,
+            keeping: Keeping::default(),
+            upload_silence: UPLOAD_SILENCE,
+            scene_folder: folder.path().to_owned(),
+            picture_folder: first.output.folder(),
+        })?;
+        self.coordinator = Some(coordinator.clone());
+        let stop_serving = CancellationToken::new();
+        let serving = tokio::spawn({
+            let (coordinator, stop) = (coordinator.clone(), stop_serving.clone());
+            async move { coordinator.run(Listener::Unix(listener), stop.cancelled()).await }
+        });
+        let setup = Setup {
+            coordinator: Address::Unix(socket),
+            threads,
+            isa: self.args.isa.0,
+            log_format: self.args.log_format,
+        };
+        let mut children =
+            Children::start(workers, setup, self.console).context("cannot start workers")?;
+
+        let rendered = tokio::select! {
+            rendered = self.all_but_the_last(first, wanted) => rendered,
+            reason = children.keep_up(&coordinator, self.args.patience) => {
+                Err(Failure::Other(anyhow!(reason)))
+            }
+            () = self.stop.cancelled() => Err(Failure::Interrupted),
+        };
+        coordinator.close();
+        let end = match rendered {
+            Ok((last, end)) => {
+                let (written, ()) = tokio::join!(self.write(last), children.go_home(&coordinator));
+                written.and(end)
+            }
+            Err(failure) => {
+                coordinator.cancel_all();
+                children.end(&coordinator).await;
+                Err(failure)
+            }
+        };
+        stop_serving.cancel();
+        serving.await??;
+        end
+    }
 }
 
 /// Chooses the quality for a picture that may take that long.
@@ -216,115 +480,6 @@ async fn begin(
     Ok(beginning.await??)
 }
 
-async fn render_here(
-    order: Order,
-    (canvas, done): Begun,
-    threads: usize,
-    args: &RenderArgs,
-    output: &Output,
-    console: &Console,
-    stop: &CancellationToken,
-) -> Result<Summary, Failure> {
-    let (size, sampling) = (order.grid.window().size(), order.settings.quality.sampling);
-    let transfer = order.transfer;
-    let tile_count = order.grid.count();
-    let progress = watch::Sender::new(Progress { tile_count, ..Progress::default() });
-    let mut shown = progress.subscribe();
-    let bar = console.start_bar(tile_count);
-    let rendering = spawn_blocking({
-        let (isa, stop) = (args.isa.0, stop.clone());
-        move || {
-            let rendered = local::render(order, canvas, &done, (threads, isa), &progress, &stop);
-            let tally = progress.borrow().tally;
-            rendered.map(|rendered| (rendered, tally))
-        }
-    });
-    let show = async {
-        while shown.changed().await.is_ok() {
-            bar.show(&shown.borrow_and_update());
-        }
-    };
-    let (rendered, ()) = tokio::join!(rendering, show);
-    drop(bar);
-    let (Some((canvas, rendering)), tally) = rendered?? else {
-        return Err(Failure::Interrupted);
-    };
-    write_picture(output, stop, move |write| write(canvas.picture())).await?;
-    Ok(Summary { size, tally, sampling, transfer, rendering, workers: 0 })
-}
-
-async fn render_with_workers(
-    order: Order,
-    (canvas, done): Begun,
-    (workers, threads): (usize, usize),
-    args: &RenderArgs,
-    output: &Output,
-    console: &Console,
-    stop: &CancellationToken,
-) -> Result<Summary, Failure> {
-    let (sampling, transfer) = (order.settings.quality.sampling, order.transfer);
-    let folder = PrivateFolder::new(&std::env::temp_dir())?;
-    let socket = folder.path().join("socket");
-    let listener = UnixListener::bind(&socket)
-        .with_context(|| format!("cannot listen on {}", socket.display()))?;
-    let coordinator = Coordinator::new(Config {
-        version: VERSION.to_owned(),
-        build: BUILD.to_owned(),
-        // The workers are this very program on this machine: nobody here has a reason to lie.
-        reference: None,
-        term: args.lease_seconds,
-        audit: 0.0,
-        keeping: Keeping::default(),
-        upload_silence: UPLOAD_SILENCE,
-        scene_folder: folder.path().to_owned(),
-        picture_folder: output.folder(),
-    })?;
-    let job = spawn_blocking({
-        let coordinator = coordinator.clone();
-        move || coordinator.submit_on(order, canvas, &done)
-    });
-    let job = job.await??;
-    let stop_serving = CancellationToken::new();
-    let serving = tokio::spawn({
-        let (coordinator, stop) = (coordinator.clone(), stop_serving.clone());
-        async move { coordinator.run(Listener::Unix(listener), stop.cancelled()).await }
-    });
-    let setup = Setup {
-        coordinator: Address::Unix(socket),
-        threads,
-        isa: args.isa.0,
-        log_format: args.log_format,
-    };
-    let mut children = Children::start(workers, setup, console).context("cannot start workers")?;
-
-    let rendered = tokio::select! {
-        rendered = wait(&job, console) => rendered,
-        reason = children.keep_up(&coordinator, args.patience) => {
-            Err(Failure::Other(anyhow!(reason)))
-        }
-        () = stop.cancelled() => Err(Failure::Interrupted),
-    };
-    coordinator.close();
-    let written = match rendered {
-        Ok(rendering) => {
-            let picture = Arc::clone(&job);
-            let writing = write_picture(output, stop, move |write| write(picture.picture()));
-            let (written, ()) = tokio::join!(writing, children.go_home(&coordinator));
-            written.map(|()| rendering)
-        }
-        Err(failure) => {
-            coordinator.cancel(job.id());
-            children.end(&coordinator).await;
-            Err(failure)
-        }
-    };
-    stop_serving.cancel();
-    serving.await??;
-    let progress = job.progress();
-    let (size, tally) = (job.picture().size(), progress.borrow().tally);
-    Ok(Summary { size, tally, sampling, transfer, rendering: written?, workers })
-}
-
 /// Shows how far a job is until it ends.
 async fn wait(job: &Job, console: &Console) -> Result<Duration, Failure> {
     let mut progress = job.progress();
@@ -343,18 +498,14 @@ async fn wait(job: &Job, console: &Console) -> Result<Duration, Failure> {
     }
 }
 
-/// Encodes a picture into its file. `with` hands the picture over.
+/// Encodes a picture into its file.
 async fn write_picture(
     output: &Output,
     stop: &CancellationToken,
-    with: impl FnOnce(&mut dyn FnMut(&Picture) -> anyhow::Result<()>) -> anyhow::Result<()>
-    + Send
-    + 'static,
+    drawn: Drawn,
 ) -> Result<(), Failure> {
     let (output, token) = (output.clone(), stop.clone());
-    let written = spawn_blocking(move || {
-        with(&mut |picture| output.write(&token, |file| picture.encode(file)))
-    });
+    let written = spawn_blocking(move || output.write(&token, |file| drawn.picture().encode(file)));
     match written.await? {
         Err(_) if stop.is_cancelled() => Err(Failure::Interrupted),
         written => Ok(written?),

@@ -94,6 +94,13 @@ impl Coordinator {
         self.shell.cancel(job);
     }
 
+    /// Ends and forgets every job.
+    pub fn cancel_all(&self) {
+        for (entry, _) in self.shell.jobs() {
+            self.shell.cancel(entry.id);
+        }
+    }
+
     /// Event: the process of a worker on this machine is known to be dead.
     pub fn on_process_exit(&self, process: u32, reason: &str) {
         self.shell.report_process_exit(process, reason);

@@ -2,6 +2,7 @@
 //! logs that count, nothing left behind.
 
 mod faults;
+mod frames;
 mod queue;
 
 use std::{
