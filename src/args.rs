@@ -264,6 +264,13 @@ pub(crate) struct RenderArgs {
     #[arg(long, conflicts_with = "time", help_heading = WORK)]
     pub(crate) resume: bool,
 
+    /// Prepare the scene anew, and keep nothing of it.
+    ///
+    /// Otherwise the user's cache folder (`$XDG_CACHE_HOME/rtfarm` or `~/.cache/rtfarm`) has large
+    /// scenes as they were prepared for earlier renders.
+    #[arg(long, help_heading = WORK)]
+    pub(crate) no_cache: bool,
+
     /// Worker processes; 0 renders in this one. Default: 2, or 1 on a single core.
     #[arg(long, value_name = "N", value_parser = value_parser!(u16).range(0..=256), help_heading = WORK)]
     workers: Option<u16>,

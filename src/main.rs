@@ -1,6 +1,7 @@
 //! The command line: arguments, errors, exit codes.
 
 mod args;
+mod cache;
 mod check;
 mod children;
 mod console;

@@ -10,7 +10,7 @@ use std::{
 use anyhow::{Context, anyhow};
 use rtfarm_coordinator::{Config, Coordinator, Job, Keeping, Listener};
 use rtfarm_core::{
-    language::draw_diagnostics,
+    language::{Style, draw_diagnostics},
     render::{DEEPEST, Sampling, Tally},
     tile::Size,
     transfer::Transfer,
@@ -24,6 +24,7 @@ use tokio_util::sync::CancellationToken;
 use crate::{
     BUILD, VERSION,
     args::{PictureArgs, RenderArgs},
+    cache::{Cache, NamedFiles},
     children::{Children, Setup},
     console::Console,
     coordinator::UPLOAD_SILENCE,
@@ -202,7 +203,8 @@ impl Render<'_> {
         let Some((picture, output)) = wanted.pop_front() else { return Ok(None) };
         let (console, stop) = (self.console, self.stop);
         let text = SceneText::read(&picture.scene, stop).await?;
-        let mut order = place(&picture, &output, text, console, stop).await?;
+        let has_cache = !self.args.no_cache;
+        let mut order = place(&picture, &output, text, has_cache, console, stop).await?;
         if let Some(time) = self.args.time {
             order = choose_quality(order, time, self.args, stop).await?;
         }
@@ -433,17 +435,45 @@ async fn place(
     args: &PictureArgs,
     output: &Output,
     text: SceneText,
+    has_cache: bool,
     console: &Console,
     stop: &CancellationToken,
 ) -> Result<Order, Failure> {
     let request = args.request(output.format());
-    let files = SceneFiles::new(&args.scene);
+    let (scene, cache) = (args.scene.clone(), if has_cache { Cache::of_user() } else { None });
     let (name, style) = (args.scene.name(), Console::drawing_style());
-    let placing = spawn_blocking(move || {
-        let placed = request.place(&text, &|name: &str| files.read(name));
-        let mut report = draw_diagnostics(&name, &text, &placed.diagnostics, style);
-        report.extend(placed.omitted.summary());
-        text.ensure_unchanged().map(|()| (placed.order, report))
+    let placing = spawn_blocking(move || -> io::Result<_> {
+        let key = cache.as_ref().map(|_| Cache::key(&name, &text, request.transfer));
+        if let (Some(cache), Some(key)) = (&cache, &key) {
+            let files = SceneFiles::new(&scene);
+            let found = cache.find(key, |name| files.read(name));
+            // What is strict wants an error where another render was told something.
+            if let Some(found) = found.filter(|found| !request.strict || found.report.is_empty()) {
+                tracing::debug!("the scene was prepared by an earlier render");
+                return Ok((request.place_ready(found.scene), found.report));
+            }
+        }
+        let (files, named) = (SceneFiles::new(&scene), NamedFiles::default());
+        let placed = request.place(&text, &|name: &str| {
+            let data = files.read(name)?;
+            if cache.is_some() {
+                named.saw(name, &data);
+            }
+            Ok(data)
+        });
+        text.ensure_unchanged()?;
+        let report = |style| {
+            let mut report = draw_diagnostics(&name, &text, &placed.diagnostics, style);
+            report.extend(placed.omitted.summary());
+            report
+        };
+        let told = report(style);
+        if let (Some(cache), Some(key)) = (&cache, &key)
+            && let (Ok(order), Some(size)) = (&placed.order, placed.size)
+        {
+            cache.keep(key, &order.prepared, size, &report(Style::Plain), named);
+        }
+        Ok((placed.order, told))
     });
     let placed = tokio::select! {
         placed = placing => placed?,

@@ -272,7 +272,7 @@ impl jobs_server::Jobs for JobsService {
                 })
             };
             let name = wanted.name.clone();
-            let Placed { order, diagnostics, omitted } = wanted.place(&text, &resolve);
+            let Placed { order, diagnostics, omitted, .. } = wanted.place(&text, &resolve);
             let mut report = draw_diagnostics(&name, &text, &diagnostics, Style::Plain);
             report.extend(omitted.summary());
             if client_gone.is_cancelled() {

@@ -8,5 +8,5 @@ mod order;
 mod progress;
 
 pub use log::FinishedTile;
-pub use order::{MOST_TILES, Order, Placed, Refusal, RenderRequest};
+pub use order::{MOST_TILES, Order, Placed, ReadyScene, Refusal, RenderRequest};
 pub use progress::{Outcome, Progress};

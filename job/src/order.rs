@@ -52,11 +52,22 @@ pub struct Order {
     pub format: PictureFormat,
 }
 
+/// A scene that was read and prepared already.
+#[derive(Debug)]
+pub struct ReadyScene {
+    /// The frame that it asks for, or the one that fits its viewport.
+    pub size: Size,
+    /// The scene.
+    pub prepared: PreparedBytes,
+}
+
 /// What came of a request and a scene's text.
 #[derive(Debug)]
 pub struct Placed {
     /// The order, or why there is none.
     pub order: Result<Order, Refusal>,
+    /// The frame that the scene asks for, or the one that fits its viewport.
+    pub size: Option<Size>,
     /// What there is to tell the scene's author.
     pub diagnostics: Vec<Diagnostic>,
     /// What there is besides.
@@ -78,18 +89,32 @@ impl RenderRequest {
         let reading = read_scene_with(text, resolve, self.transfer);
         let reading = if self.strict { reading.into_strict() } else { reading };
         let Reading { scene, diagnostics, omitted } = reading;
+        let size = scene.as_ref().and_then(own_size);
         let order = match &scene {
             Some(scene) => self.prepare(scene),
             None => Err(Refusal::Scene),
         };
-        Placed { order, diagnostics, omitted }
+        Placed { order, size, diagnostics, omitted }
+    }
+
+    /// Takes a scene as it was prepared for another request with the same transfer.
+    pub fn place_ready(self, scene: ReadyScene) -> Result<Order, Refusal> {
+        let (settings, grid) = self.frame(scene.size)?;
+        Ok(self.order(scene.prepared, settings, grid))
     }
 
     fn prepare(self, scene: &Scene) -> Result<Order, Refusal> {
+        let other = |error: PrepareError| Refusal::Other(error.to_string());
+        let size = own_size(scene).ok_or(PrepareError::NoViewport).map_err(other)?;
+        let (settings, grid) = self.frame(size)?;
+        let prepared = prepare(scene).map_err(other)?;
+        Ok(self.order(prepared, settings, grid))
+    }
+
+    /// The frame, its window and tiles, of a scene that asks for this size.
+    fn frame(&self, own: Size) -> Result<(Settings, TileGrid), Refusal> {
         let other = |reason: String| Refusal::Other(reason);
-        let viewport = scene.viewport.ok_or(PrepareError::NoViewport);
-        let viewport = viewport.map_err(|error| other(error.to_string()))?;
-        let size = self.size.or(scene.size_hint).unwrap_or_else(|| viewport.default_size());
+        let size = self.size.unwrap_or(own);
         let window = match self.crop {
             Some(crop) => crop.of(size).map_err(|error| other(error.to_string()))?,
             None => Area::whole(size),
@@ -107,11 +132,19 @@ impl RenderRequest {
                 count = grid.count()
             )));
         }
-        let prepared = prepare(scene).map_err(|error| other(error.to_string()))?;
-        let Self { name, quality, transfer, format, .. } = self;
-        let settings = Settings { size, quality };
-        Ok(Order { name, prepared, settings, grid, transfer, format })
+        Ok((Settings { size, quality: self.quality }, grid))
     }
+
+    fn order(self, prepared: PreparedBytes, settings: Settings, grid: TileGrid) -> Order {
+        let Self { name, transfer, format, .. } = self;
+        Order { name, prepared, settings, grid, transfer, format }
+    }
+}
+
+/// The frame that a scene asks for, or the one that fits its viewport.
+fn own_size(scene: &Scene) -> Option<Size> {
+    let viewport = scene.viewport?;
+    Some(scene.size_hint.unwrap_or_else(|| viewport.default_size()))
 }
 
 #[cfg(test)]
