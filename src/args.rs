@@ -42,7 +42,7 @@ pub(crate) enum Command {
     /// List a farm's workers.
     Workers(FarmArgs),
     /// Follow a job to its end; exits with 1 when it fails.
-    Watch(JobArgs),
+    Watch(WatchArgs),
     /// Fetch the picture of a finished job, which the farm then forgets.
     Image(ImageArgs),
     /// End a job and forget it.
@@ -290,6 +290,11 @@ pub(crate) struct WorkerArgs {
     #[arg(long, value_name = "auto|scalar|sse2|avx2", default_value = "auto")]
     pub(crate) isa: IsaChoice,
 
+    /// Memory in GB for prepared scenes; a scene that needs more is left to others. Default: three
+    /// quarters of what the machine has, or of what its control group allows.
+    #[arg(long, value_name = "GB", value_parser = parse_gigabytes)]
+    memory: Option<u64>,
+
     /// How long to go on without a coordinator.
     #[arg(long, value_name = "S", default_value = "60", value_parser = parse_seconds)]
     pub(crate) patience: Duration,
@@ -378,6 +383,20 @@ pub(crate) struct JobArgs {
 
     #[command(flatten)]
     pub(crate) farm: FarmArgs,
+}
+
+#[derive(Debug, ClapArgs)]
+pub(crate) struct WatchArgs {
+    /// The job's number.
+    #[arg(value_name = "JOB")]
+    pub(crate) job: u64,
+
+    #[command(flatten)]
+    pub(crate) farm: FarmArgs,
+
+    /// How long to go on without a coordinator once it was reached.
+    #[arg(long, value_name = "S", default_value = "60", value_parser = parse_seconds)]
+    pub(crate) patience: Duration,
 }
 
 #[derive(Debug, ClapArgs)]
@@ -517,6 +536,14 @@ impl WorkerArgs {
     pub(crate) fn threads(&self) -> usize {
         self.threads.map_or_else(core_count, usize::from)
     }
+
+    /// Bytes for prepared scenes. A local worker takes what its parent could prepare.
+    pub(crate) fn memory(&self) -> Option<u64> {
+        match self.parent {
+            Some(_) => None,
+            None => self.memory.or_else(rtfarm_worker::memory_for_scenes),
+        }
+    }
 }
 
 impl Command {
@@ -584,6 +611,13 @@ fn parse_seconds(text: &str) -> Result<Duration, String> {
     } else {
         Err("a time is from 0.1 to 86400 seconds".to_owned())
     }
+}
+
+/// Answers with bytes.
+fn parse_gigabytes(text: &str) -> Result<u64, &'static str> {
+    let bytes = text.parse().ok().map(|gigabytes: f64| gigabytes * 1e9);
+    let bytes = bytes.filter(|bytes| (1.0..=1e18).contains(bytes));
+    bytes.map(|bytes| bytes as u64).ok_or("memory is a number of GB above 0")
 }
 
 fn parse_fraction(text: &str) -> Result<f64, &'static str> {

@@ -78,10 +78,17 @@ fn people_can_live_with_the_queue() {
     assert_eq!(json(&place, &url, &["priority", &second, "5"])["priority"], 5);
     assert_eq!(order(&place, &url), [&second[..], &first]);
     assert_eq!(json(&place, &url, &["pause", &second])["paused"], true);
+    let mut watch = place.start("watch.log", &["watch", &second, "--coordinator", &url]);
+    let impatient = ["watch", &second, "--patience", "0.1", "--coordinator", &url];
+    let mut impatient = place.start("impatient.log", &impatient);
+    // Both hear of the job before its coordinator goes.
+    thread::sleep(Duration::from_millis(300));
 
     // All of it outlives the coordinator.
     coordinator.signal(Signal::KILL);
     coordinator.wait();
+    assert_eq!(impatient.wait().code(), Some(1));
+    assert!(impatient.log().contains("error: "), "{}", impatient.log());
     (coordinator, url) = start_farm(&place, url.strip_prefix("http://").unwrap());
     assert_eq!(order(&place, &url), [&second[..], &first]);
     let of_second = entry(&place, &url, &second);
@@ -99,7 +106,7 @@ fn people_can_live_with_the_queue() {
     assert!(log.contains("the job has not finished"), "{log}");
     json(&place, &url, &["image", &first, "-o", "early.png", "--partial"]);
     let early = image::open(place.path("early.png")).unwrap();
-    assert_eq!((early.width(), early.height()), (320, 240));
+    assert_eq!((early.width(), early.height()), (160, 120));
     json(&place, &url, &["cancel", &first]);
     assert_eq!(order(&place, &url), [&second[..]]);
     for unknown in [&["cancel", &first[..]][..], &["pause", &first], &["watch", &first]] {
@@ -115,7 +122,10 @@ fn people_can_live_with_the_queue() {
     assert_eq!(json(&place, &url, &["drain", &number])["standing"], "draining");
     assert!(worker.wait().success(), "{}", worker.log());
     assert_eq!(json(&place, &url, &["workers"]), Value::Array(Vec::new()));
+    assert!(watch.child.try_wait().unwrap().is_none(), "it is watched still");
     json(&place, &url, &["cancel", &second]);
+    assert_eq!(watch.wait().code(), Some(1));
+    assert!(watch.log().contains("the job failed: it was cancelled"), "{}", watch.log());
 
     // A worker that is disabled gets nothing, until it is enabled.
     let small = ["--size", "64x48", "--samples", "2"];
@@ -139,18 +149,37 @@ fn people_can_live_with_the_queue() {
     worker.signal(Signal::TERM);
     worker.wait();
 
-    // A tile ends three workers, and its job with them; then it is tried again.
-    let one_tile = ["--size", "48x48", "--tile", "48", "--samples", "2048"];
-    let fourth = detach(&place, &url, &one_tile);
+    // A worker that has no memory for a scene gets none of it, and its owner is told.
+    let small_args = ["worker", "--threads", "1", "--memory", "0.0000001", "--coordinator", &url];
+    let mut tiny = place.start("tiny.log", &small_args);
+    let mut submit = place.start(
+        "submit.log",
+        &[&["submit", "scene.rt", "-o", "out.png", "--coordinator", &url], &small[..]].concat(),
+    );
+    poll(|| submit.log().contains("no worker can hold its scene of ").then_some(()));
+    let told = ask(&place, &url, &["jobs"]).1;
+    assert!(told.contains(" waits: no worker can hold its scene of "), "{told}");
+    let mut worker = start("worker.log");
+    assert!(submit.wait().success(), "{}", submit.log());
+    for worker in [&mut tiny, &mut worker] {
+        worker.signal(Signal::TERM);
+        worker.wait();
+    }
+
+    // A tile ends three workers; the other is finished, and the job fails in part; then it is tried
+    // again.
+    let two_tiles = ["--size", "96x48", "--tile", "48", "--samples", "1024"];
+    let fourth = detach(&place, &url, &two_tiles);
     for _ in 0..3 {
         let worker = start("worker.log");
-        poll(|| (entry(&place, &url, &fourth)["workers_now"] == 1).then_some(()));
+        let is_in_work = |entry: Value| entry["workers_now"] == 1 && entry["tiles_done"] == 1;
+        poll(|| is_in_work(entry(&place, &url, &fourth)).then_some(()));
         worker.signal(Signal::KILL);
         poll(|| (entry(&place, &url, &fourth)["workers_now"] == 0).then_some(()));
     }
     let (code, _, log) = ask(&place, &url, &["watch", &fourth]);
     assert_eq!(code, Some(1));
-    assert!(log.contains("the job failed: 0 of 1 tiles are right; set aside"), "{log}");
+    assert!(log.contains("the job failed: 1 of 2 tiles are right; set aside"), "{log}");
     coordinator.signal(Signal::TERM);
     assert!(coordinator.wait().success());
     (coordinator, url) = start_farm(&place, url.strip_prefix("http://").unwrap());
@@ -159,7 +188,7 @@ fn people_can_live_with_the_queue() {
     let _worker = place.start("worker.log", &["worker", "--threads", "1", "--coordinator", &url]);
     assert_eq!(json(&place, &url, &["watch", &fourth])["state"], "finished");
     json(&place, &url, &["image", &fourth, "-o", "out.png"]);
-    let here = place.render("here.png", &[&one_tile[..], &["--workers", "0"]].concat());
+    let here = place.render("here.png", &[&two_tiles[..], &["--workers", "0"]].concat());
     assert!(fs::read(place.path("out.png")).unwrap() == here);
     coordinator.signal(Signal::TERM);
     coordinator.wait();
