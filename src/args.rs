@@ -21,11 +21,41 @@ use crate::{frames::FrameRange, output::Output};
 
 /// Renders scenes in the rt language, on one machine or many.
 #[derive(Debug, Parser)]
-#[command(version, propagate_version = true)]
+#[command(version, propagate_version = true, after_help = AFTER_HELP)]
 pub(crate) struct Args {
     #[command(subcommand)]
     pub(crate) command: Command,
+
+    /// Write nothing but warnings, errors and what was asked for.
+    #[arg(short, long, global = true, conflicts_with = "verbose", help_heading = TALK)]
+    pub(crate) quiet: bool,
+
+    /// Write a line for each tile and each worker on a terminal, too; elsewhere, more.
+    #[arg(short, long, global = true, help_heading = TALK)]
+    pub(crate) verbose: bool,
 }
+
+const AFTER_HELP: &str = "\
+Examples:
+  rtfarm render scenes/gnome.rt -o gnome.png
+  rtfarm coordinator --state farm &
+  rtfarm worker --coordinator http://127.0.0.1:7878 &
+  rtfarm submit scenes/gnome.rt -o gnome.png --coordinator http://127.0.0.1:7878
+
+Exit codes: 0 done, 1 failed, 2 the scene or the command line is wrong, 130 stopped by a signal.
+Options that say what they are from the environment ([env: ...]) may be given there.";
+
+/// Options that say how much is told.
+const TALK: &str = "What is told";
+
+/// Options that say which farm is meant.
+const FARM: &str = "The farm";
+
+/// Options that say what the picture is like.
+const PICTURE: &str = "The picture";
+
+/// Options that say who renders.
+const WORK: &str = "The work";
 
 #[derive(Debug, Subcommand)]
 pub(crate) enum Command {
@@ -63,6 +93,10 @@ pub(crate) enum Command {
     Enable(StationArgs),
     /// Say what is wrong with a scene, and what it needs.
     Check(CheckArgs),
+    /// Write a shell's completions to standard output.
+    Completions(CompletionsArgs),
+    /// Write manual pages, one a command, into a folder.
+    Man(ManArgs),
     /// Measure speed against error of a scene, whose picture at many samples stands for the truth.
     Report(ReportArgs),
 }
@@ -78,8 +112,9 @@ pub(crate) struct SceneArgs {
     #[arg(long)]
     pub(crate) strict: bool,
 
-    /// Let the scene name files in this folder, too; otherwise they lie in its own or below. May be
-    /// repeated.
+    /// Let the scene name files in this folder, too.
+    ///
+    /// Otherwise they lie in its own folder or below. May be repeated.
     #[arg(long, value_name = "DIR")]
     pub(crate) allow_files: Vec<PathBuf>,
 }
@@ -101,8 +136,22 @@ pub(crate) struct CheckArgs {
     pub(crate) scene: SceneArgs,
 
     /// Answer in JSON.
-    #[arg(long)]
+    #[arg(long, help_heading = TALK)]
     pub(crate) json: bool,
+}
+
+#[derive(Debug, ClapArgs)]
+pub(crate) struct CompletionsArgs {
+    /// The shell.
+    #[arg(value_name = "SHELL")]
+    pub(crate) shell: clap_complete::Shell,
+}
+
+#[derive(Debug, ClapArgs)]
+pub(crate) struct ManArgs {
+    /// The folder; it is made if there is none.
+    #[arg(value_name = "DIR")]
+    pub(crate) folder: PathBuf,
 }
 
 #[derive(Debug, ClapArgs)]
@@ -111,8 +160,9 @@ pub(crate) struct ReportArgs {
     #[arg(value_name = "SCENE")]
     scene: PathBuf,
 
-    /// Let the scene name files in this folder, too; otherwise they lie in its own or below. May be
-    /// repeated.
+    /// Let the scene name files in this folder, too.
+    ///
+    /// Otherwise they lie in its own folder or below. May be repeated.
     #[arg(long, value_name = "DIR")]
     allow_files: Vec<PathBuf>,
 
@@ -141,51 +191,54 @@ pub(crate) struct PictureArgs {
     pub(crate) output: PathBuf,
 
     /// The picture's size in pixels; the size that the scene asks for by default.
-    #[arg(long, value_name = "WxH", value_parser = parse_size)]
+    #[arg(long, value_name = "WxH", value_parser = parse_size, help_heading = PICTURE)]
     size: Option<Size>,
 
-    /// Show only the window whose upper left pixel is X,Y, of W columns and H rows. Its pixels are
-    /// those of the whole picture, to the bit.
-    #[arg(long, value_name = "X,Y,W,H", value_parser = parse_crop)]
+    /// Show only the window whose upper left pixel is X,Y, of W columns and H rows.
+    ///
+    /// Its pixels are those of the whole picture, to the bit.
+    #[arg(long, value_name = "X,Y,W,H", value_parser = parse_crop, help_heading = PICTURE)]
     crop: Option<Crop>,
 
     /// The same number of samples in every pixel.
-    #[arg(long, value_name = "N", value_parser = parse_samples, conflicts_with_all = ["error", "max_samples"])]
+    #[arg(long, value_name = "N", value_parser = parse_samples, conflicts_with_all = ["error", "max_samples"], help_heading = PICTURE)]
     samples: Option<SampleCount>,
 
-    /// Sample each pixel until its standard error is below this, where 1 is full light; not
-    /// encoded, whatever the --transfer. Default: 1/255, an 8-bit step.
-    #[arg(long, value_name = "ERROR", default_value_t = StandardError::EIGHT_BIT_STEP, hide_default_value = true, value_parser = parse_error)]
+    /// Sample each pixel until its standard error is below this, where 1 is full light [default: 1/255].
+    ///
+    /// It is an error of light, not of encoded values, whatever the --transfer.
+    #[arg(long, value_name = "ERROR", default_value_t = StandardError::EIGHT_BIT_STEP, hide_default_value = true, value_parser = parse_error, help_heading = PICTURE)]
     error: StandardError,
 
     /// But at most so often.
-    #[arg(long, value_name = "N", default_value_t = SampleLimit::DEFAULT, value_parser = parse_max_samples)]
+    #[arg(long, value_name = "N", default_value_t = SampleLimit::DEFAULT, value_parser = parse_max_samples, help_heading = PICTURE)]
     max_samples: SampleLimit,
 
     /// Chooses the random numbers.
-    #[arg(long, value_name = "N", default_value_t = 0)]
+    #[arg(long, value_name = "N", default_value_t = 0, help_heading = PICTURE)]
     seed: u64,
 
     /// Show every surface in its plain colour, as in a scene without light.
-    #[arg(long)]
+    #[arg(long, help_heading = PICTURE)]
     flat: bool,
 
     /// Whether surfaces that mirror light others.
-    #[arg(long, value_name = "on|off", default_value = "on", hide_possible_values = true)]
+    #[arg(long, value_name = "on|off", default_value = "on", hide_possible_values = true, help_heading = PICTURE)]
     secondary: Switch,
 
     /// The side of a tile in pixels; by default the one that gives about 1000 tiles.
-    #[arg(long, value_name = "N", value_parser = value_parser!(u64).range(TileGrid::SIDES))]
+    #[arg(long, value_name = "N", value_parser = value_parser!(u64).range(TileGrid::SIDES), help_heading = PICTURE)]
     tile: Option<u64>,
 
-    /// What the numbers of colours say: the light itself, or light encoded by the sRGB curve. Then
-    /// colours of materials, textures, point lights and the background are decoded, and a PNG is
+    /// What the numbers of colours say: the light itself, or light encoded by the sRGB curve.
+    ///
+    /// Then colours of materials, textures, point lights and the background are decoded, and a PNG is
     /// encoded; an EXR holds light.
-    #[arg(long, value_name = "none|srgb", default_value = "none", value_parser = parse_transfer)]
+    #[arg(long, value_name = "none|srgb", default_value = "none", value_parser = parse_transfer, help_heading = PICTURE)]
     transfer: Transfer,
 
     /// Bits a channel of a PNG.
-    #[arg(long, value_name = "BITS", value_parser = ["8", "16"])]
+    #[arg(long, value_name = "BITS", value_parser = ["8", "16"], help_heading = PICTURE)]
     depth: Option<String>,
 }
 
@@ -194,117 +247,120 @@ pub(crate) struct RenderArgs {
     #[command(flatten)]
     pub(crate) picture: PictureArgs,
 
-    /// Render these frames of a sequence: 1-48, or 1-48x2 for each second one. SCENE and FILE then have
-    /// a place for the number, like shot.%04d.rt. The next frame fills the workers while the last tiles
-    /// of one are rendered.
-    #[arg(long, value_name = "A-B", conflicts_with = "time")]
+    /// Render these frames of a sequence: 1-48, or 1-48x2 for each second one.
+    ///
+    /// SCENE and FILE then have a place for the number, like shot.%04d.rt. The next frame fills the
+    /// workers while the last tiles of one are rendered.
+    #[arg(long, value_name = "A-B", conflicts_with = "time", help_heading = PICTURE)]
     pub(crate) frames: Option<FrameRange>,
 
     /// Make the picture as good as this many seconds allow: a pilot chooses the --error and the
     /// --max-samples, and tells them.
-    #[arg(long, value_name = "S", value_parser = parse_seconds, conflicts_with_all = ["samples", "error", "max_samples"])]
+    #[arg(long, value_name = "S", value_parser = parse_seconds, conflicts_with_all = ["samples", "error", "max_samples"], help_heading = PICTURE)]
     pub(crate) time: Option<Duration>,
 
-    /// Go on with what an earlier render with --resume left when it was interrupted, however that was.
+    /// Go on with what an earlier render with --resume left when it was interrupted.
+    ///
     /// The folder FILE.rtfarm has it until the picture is there.
-    #[arg(long, conflicts_with = "time")]
+    #[arg(long, conflicts_with = "time", help_heading = WORK)]
     pub(crate) resume: bool,
 
     /// Worker processes; 0 renders in this one. Default: 2, or 1 on a single core.
-    #[arg(long, value_name = "N", value_parser = value_parser!(u16).range(0..=256))]
+    #[arg(long, value_name = "N", value_parser = value_parser!(u16).range(0..=256), help_heading = WORK)]
     workers: Option<u16>,
 
     /// Threads of each worker; by default the cores are shared out.
-    #[arg(long, value_name = "N", value_parser = value_parser!(u16).range(1..=1024))]
+    #[arg(long, value_name = "N", value_parser = value_parser!(u16).range(1..=1024), help_heading = WORK)]
     threads: Option<u16>,
 
     /// The instruction set that the kernels use; all give the same bytes.
-    #[arg(long, value_name = "auto|scalar|sse2|avx2", default_value = "auto")]
+    #[arg(long, value_name = "auto|scalar|sse2|avx2", default_value = "auto", help_heading = WORK)]
     pub(crate) isa: IsaChoice,
 
     /// A worker that makes no progress for this long loses its tiles to others.
-    #[arg(long, value_name = "S", default_value = "4", value_parser = parse_seconds)]
+    #[arg(long, value_name = "S", default_value = "4", value_parser = parse_seconds, help_heading = WORK)]
     pub(crate) lease_seconds: Duration,
 
     /// How long to go on though no worker process does anything.
-    #[arg(long, value_name = "S", default_value = "60", value_parser = parse_seconds)]
+    #[arg(long, value_name = "S", default_value = "60", value_parser = parse_seconds, help_heading = WORK)]
     pub(crate) patience: Duration,
 
     /// How log lines are written.
-    #[arg(long, value_name = "FORMAT", default_value = "text")]
+    #[arg(long, value_name = "FORMAT", default_value = "text", help_heading = TALK)]
     pub(crate) log_format: LogFormat,
 }
 
 #[derive(Debug, ClapArgs)]
 pub(crate) struct CoordinatorArgs {
     /// The address and port to listen on; port 0 takes a free one.
-    #[arg(long, value_name = "ADDR:PORT", default_value = "127.0.0.1:7878")]
+    #[arg(long, value_name = "ADDR:PORT", default_value = "127.0.0.1:7878", env = "RTFARM_LISTEN")]
     pub(crate) listen: String,
 
     /// Listen to other machines though nothing is encrypted and nobody is asked for a token.
-    #[arg(long)]
+    #[arg(long, env = "RTFARM_INSECURE")]
     pub(crate) insecure: bool,
 
     /// Keep the farm's jobs and pictures in this folder, which is made if there is none: a coordinator
     /// that is started on it again goes on with them. Without it they end with the coordinator.
-    #[arg(long, value_name = "DIR")]
+    #[arg(long, value_name = "DIR", env = "RTFARM_STATE")]
     pub(crate) state: Option<PathBuf>,
 
     /// Lose no finished tile in a power cut; otherwise those of the last second may be rendered again.
-    #[arg(long, requires = "state")]
+    #[arg(long, requires = "state", env = "RTFARM_DURABLE")]
     pub(crate) durable: bool,
 
     /// A worker that makes no progress for this long loses its tiles to others.
-    #[arg(long, value_name = "S", default_value = "4", value_parser = parse_seconds)]
+    #[arg(long, value_name = "S", default_value = "4", value_parser = parse_seconds, env = "RTFARM_LEASE_SECONDS", help_heading = WORK)]
     pub(crate) lease_seconds: Duration,
 
     /// How long a job that has ended is kept if nobody fetches its picture.
-    #[arg(long, value_name = "HOURS", default_value = "168", value_parser = value_parser!(u32).range(1..=87_600))]
+    #[arg(long, value_name = "HOURS", default_value = "168", value_parser = value_parser!(u32).range(1..=87_600), env = "RTFARM_KEEP_HOURS")]
     pub(crate) keep_hours: u32,
 
     /// The most bytes, in GB, that jobs that have ended are kept in; the oldest go first.
-    #[arg(long, value_name = "GB", default_value = "16", value_parser = value_parser!(u32).range(1..))]
+    #[arg(long, value_name = "GB", default_value = "16", value_parser = value_parser!(u32).range(1..), env = "RTFARM_KEEP_GB")]
     pub(crate) keep_gb: u32,
 
     /// How much of what a worker renders another renders again, to find out who lies, from 0 to 1;
     /// besides, each worker's first tile of a picture. 0 compares nothing.
-    #[arg(long, value_name = "FRACTION", default_value = "0.01", value_parser = parse_fraction)]
+    #[arg(long, value_name = "FRACTION", default_value = "0.01", value_parser = parse_fraction, env = "RTFARM_AUDIT", help_heading = WORK)]
     pub(crate) audit: f64,
 
     /// How log lines are written.
-    #[arg(long, value_name = "FORMAT", default_value = "text")]
+    #[arg(long, value_name = "FORMAT", default_value = "text", env = "RTFARM_LOG_FORMAT", help_heading = TALK)]
     pub(crate) log_format: LogFormat,
 }
 
 #[derive(Debug, ClapArgs)]
 pub(crate) struct WorkerArgs {
     /// Where the coordinator is: `http://host:7878` or `unix:/path/socket`.
-    #[arg(long, value_name = "URL")]
+    #[arg(long, value_name = "URL", env = "RTFARM_COORDINATOR", help_heading = FARM)]
     pub(crate) coordinator: Address,
 
     /// Threads; all cores by default.
-    #[arg(long, value_name = "N", value_parser = value_parser!(u16).range(1..=1024))]
+    #[arg(long, value_name = "N", value_parser = value_parser!(u16).range(1..=1024), env = "RTFARM_THREADS", help_heading = WORK)]
     threads: Option<u16>,
 
     /// The instruction set that the kernels use; all give the same bytes.
-    #[arg(long, value_name = "auto|scalar|sse2|avx2", default_value = "auto")]
+    #[arg(long, value_name = "auto|scalar|sse2|avx2", default_value = "auto", env = "RTFARM_ISA", help_heading = WORK)]
     pub(crate) isa: IsaChoice,
 
-    /// Memory in GB for prepared scenes; a scene that needs more is left to others. Default: three
-    /// quarters of what the machine has, or of what its control group allows.
-    #[arg(long, value_name = "GB", value_parser = parse_gigabytes)]
+    /// Memory in GB for prepared scenes; a scene that needs more is left to others.
+    ///
+    /// By default three quarters of what the machine has, or of what its control group allows.
+    #[arg(long, value_name = "GB", value_parser = parse_gigabytes, env = "RTFARM_MEMORY", help_heading = WORK)]
     memory: Option<u64>,
 
     /// How long to go on without a coordinator.
-    #[arg(long, value_name = "S", default_value = "60", value_parser = parse_seconds)]
+    #[arg(long, value_name = "S", default_value = "60", value_parser = parse_seconds, env = "RTFARM_PATIENCE", help_heading = WORK)]
     pub(crate) patience: Duration,
 
     /// How long the tiles in hand may still take after SIGTERM.
-    #[arg(long, value_name = "S", default_value = "10", value_parser = parse_seconds)]
+    #[arg(long, value_name = "S", default_value = "10", value_parser = parse_seconds, env = "RTFARM_GRACE", help_heading = WORK)]
     pub(crate) grace: Duration,
 
     /// How log lines are written.
-    #[arg(long, value_name = "FORMAT", default_value = "text")]
+    #[arg(long, value_name = "FORMAT", default_value = "text", env = "RTFARM_LOG_FORMAT", help_heading = TALK)]
     pub(crate) log_format: LogFormat,
 
     /// Live no longer than this process, which has started this one.
@@ -322,44 +378,44 @@ pub(crate) struct SubmitArgs {
     pub(crate) picture: PictureArgs,
 
     /// Where the coordinator is: `http://host:7878` or `unix:/path/socket`.
-    #[arg(long, value_name = "URL")]
+    #[arg(long, value_name = "URL", env = "RTFARM_COORDINATOR", help_heading = FARM)]
     pub(crate) coordinator: Address,
 
     /// Print the job's number and end: the job goes on by itself, and `rtfarm image` fetches what -o
     /// says. Otherwise an interruption cancels it.
-    #[arg(long)]
+    #[arg(long, help_heading = FARM)]
     pub(crate) detach: bool,
 
     /// What the job is called; the scene's file by default.
-    #[arg(long, value_name = "NAME")]
+    #[arg(long, value_name = "NAME", help_heading = FARM)]
     pub(crate) name: Option<String>,
 
     /// Who wants it; the user's login name by default.
-    #[arg(long, value_name = "OWNER")]
+    #[arg(long, value_name = "OWNER", env = "RTFARM_OWNER", help_heading = FARM)]
     pub(crate) owner: Option<String>,
 
     /// Submit only once under this key: a job that has it already is taken for this one.
-    #[arg(long, value_name = "KEY", value_parser = NonEmptyStringValueParser::new())]
+    #[arg(long, value_name = "KEY", value_parser = NonEmptyStringValueParser::new(), help_heading = FARM)]
     pub(crate) key: Option<String>,
 
     /// Jobs of a higher priority come first.
-    #[arg(long, value_name = "N", default_value_t = 0, allow_negative_numbers = true)]
+    #[arg(long, value_name = "N", default_value_t = 0, allow_negative_numbers = true, env = "RTFARM_PRIORITY", help_heading = FARM)]
     pub(crate) priority: i32,
 
     /// The most workers that render it at the same time.
-    #[arg(long, value_name = "N", value_parser = value_parser!(u32).range(1..))]
+    #[arg(long, value_name = "N", value_parser = value_parser!(u32).range(1..), env = "RTFARM_MAX_WORKERS", help_heading = FARM)]
     pub(crate) max_workers: Option<u32>,
 
     /// Answer in JSON.
-    #[arg(long)]
+    #[arg(long, help_heading = TALK)]
     pub(crate) json: bool,
 
     /// How long to go on without a coordinator once it was reached.
-    #[arg(long, value_name = "S", default_value = "60", value_parser = parse_seconds)]
+    #[arg(long, value_name = "S", default_value = "60", value_parser = parse_seconds, env = "RTFARM_PATIENCE", help_heading = FARM)]
     pub(crate) patience: Duration,
 
     /// How log lines are written.
-    #[arg(long, value_name = "FORMAT", default_value = "text")]
+    #[arg(long, value_name = "FORMAT", default_value = "text", env = "RTFARM_LOG_FORMAT", help_heading = TALK)]
     pub(crate) log_format: LogFormat,
 }
 
@@ -367,11 +423,11 @@ pub(crate) struct SubmitArgs {
 #[derive(Debug, ClapArgs)]
 pub(crate) struct FarmArgs {
     /// Where the coordinator is: `http://host:7878` or `unix:/path/socket`.
-    #[arg(long, value_name = "URL")]
+    #[arg(long, value_name = "URL", env = "RTFARM_COORDINATOR", help_heading = FARM)]
     pub(crate) coordinator: Address,
 
     /// Answer in JSON.
-    #[arg(long)]
+    #[arg(long, help_heading = TALK)]
     pub(crate) json: bool,
 }
 
@@ -395,7 +451,7 @@ pub(crate) struct WatchArgs {
     pub(crate) farm: FarmArgs,
 
     /// How long to go on without a coordinator once it was reached.
-    #[arg(long, value_name = "S", default_value = "60", value_parser = parse_seconds)]
+    #[arg(long, value_name = "S", default_value = "60", value_parser = parse_seconds, env = "RTFARM_PATIENCE", help_heading = FARM)]
     pub(crate) patience: Duration,
 }
 
@@ -434,7 +490,7 @@ pub(crate) struct ImageArgs {
     pub(crate) keep: bool,
 
     /// Answer in JSON.
-    #[arg(long)]
+    #[arg(long, help_heading = TALK)]
     pub(crate) json: bool,
 
     /// Where the picture goes; the extension should be that of the file that was asked for.
@@ -442,7 +498,7 @@ pub(crate) struct ImageArgs {
     pub(crate) output: PathBuf,
 
     /// Where the coordinator is: `http://host:7878` or `unix:/path/socket`.
-    #[arg(long, value_name = "URL")]
+    #[arg(long, value_name = "URL", env = "RTFARM_COORDINATOR", help_heading = FARM)]
     pub(crate) coordinator: Address,
 }
 

@@ -182,7 +182,14 @@ impl Children {
 }
 
 fn start(setup: &Setup) -> io::Result<Child> {
-    Command::new(env::current_exe()?)
+    let mut command = Command::new(env::current_exe()?);
+    for (name, _) in env::vars_os() {
+        // What it says is meant for workers that somebody starts.
+        if name.as_encoded_bytes().starts_with(b"RTFARM_") {
+            command.env_remove(name);
+        }
+    }
+    command
         .arg("worker")
         .args(["--coordinator", &setup.coordinator.to_string()])
         .args(["--threads", &setup.threads.to_string()])

@@ -19,7 +19,7 @@ use tracing_subscriber::{
 };
 
 use crate::{
-    args::{Command, LogFormat},
+    args::{Args, Command, LogFormat},
     log_queue::LogQueue,
     plain::plain,
 };
@@ -30,6 +30,7 @@ pub(crate) struct Console {
     /// Set while a bar is on the screen; lines are then written above it.
     bar: Arc<Mutex<Option<ProgressBar>>>,
     wants_bar: bool,
+    is_quiet: bool,
     /// Where lines wait to be written; without it they are written at once.
     lines: Option<LogQueue>,
 }
@@ -43,16 +44,25 @@ impl Console {
         Self::default()
     }
 
-    /// Standard error as a command uses it: with a bar on a terminal, with log lines elsewhere.
-    /// `RUST_LOG` chooses others.
-    pub(crate) fn new(command: &Command) -> Self {
+    /// Standard error as a command uses it: with a bar on a terminal, with log lines elsewhere, unless
+    /// it is to be quiet or verbose. `RUST_LOG` chooses others.
+    pub(crate) fn new(args: &Args) -> Self {
+        let Args { command, quiet: is_quiet, verbose: is_verbose } = args;
         let format = command.log_format();
         let has_bar =
             matches!(command, Command::Render(_) | Command::Submit(_) | Command::Watch(_))
                 && format == LogFormat::Text
+                && !is_quiet
+                && !is_verbose
                 && io::stderr().is_terminal();
         let is_local_worker = matches!(command, Command::Worker(args) if args.parent.is_some());
-        let level = if has_bar || is_local_worker { LevelFilter::WARN } else { LevelFilter::INFO };
+        let level = if has_bar || is_local_worker || *is_quiet {
+            LevelFilter::WARN
+        } else if *is_verbose && !io::stderr().is_terminal() {
+            LevelFilter::DEBUG
+        } else {
+            LevelFilter::INFO
+        };
         let bar = Arc::<Mutex<Option<ProgressBar>>>::default();
         let describe = match format {
             LogFormat::Text => {
@@ -71,7 +81,7 @@ impl Console {
                 write_above(bar.as_ref(), line);
             }
         });
-        let console = Self { bar, wants_bar: has_bar, lines: Some(lines) };
+        let console = Self { bar, wants_bar: has_bar, is_quiet: *is_quiet, lines: Some(lines) };
         let filter = filter(std::env::var("RUST_LOG").ok().as_deref(), level);
         let lines = tracing_subscriber::fmt()
             .with_max_level(LevelFilter::TRACE)
@@ -82,6 +92,11 @@ impl Console {
             LogFormat::Json => lines.json().flatten_event(true).finish().with(filter).init(),
         }
         console
+    }
+
+    /// Whether nothing is said of what went well.
+    pub(crate) fn is_quiet(&self) -> bool {
+        self.is_quiet
     }
 
     /// Writes a line.

@@ -172,11 +172,13 @@ mod tests {
     #[test]
     fn who_logs_never_waits_and_dropped_lines_are_counted() {
         let (open, gate) = mpsc::channel::<()>();
+        let (begin, begun) = mpsc::channel();
         let (send, written) = mpsc::channel();
         let queue = LogQueue::start(
             |count| format!("dropped {count}\n"),
             move |lines| {
                 // Nobody reads until the gate is open.
+                let _ = begin.send(());
                 let _ = gate.recv();
                 let _ = send.send(String::from_utf8(lines.to_vec()).unwrap());
             },
@@ -184,6 +186,9 @@ mod tests {
         let count = 3 * MOST_BYTES / 1000;
         for number in 0..count {
             queue.push(format!("{number:999}\n").as_bytes());
+            if number == 0 {
+                begun.recv().unwrap();
+            }
         }
         queue.flush(Duration::from_millis(1));
         drop(open);

@@ -10,6 +10,7 @@ mod frames;
 mod image;
 mod local;
 mod log_queue;
+mod manual;
 mod output;
 mod pilot;
 mod plain;
@@ -49,7 +50,7 @@ fn main() -> ExitCode {
         Ok(args) => args,
         Err(error) => return failure::explain_usage(&error),
     };
-    let console = Console::new(&args.command);
+    let console = Console::new(&args);
     let runtime =
         tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build();
     let runtime = match runtime {
@@ -107,6 +108,8 @@ async fn run(command: Command, console: &Console) -> Result<(), Failure> {
         }
         Command::Report(args) => report::run(args, console, &stop).await,
         Command::Check(args) => check::run(args, console, &stop).await,
+        Command::Completions(args) => manual::write_completions(&args),
+        Command::Man(args) => manual::write_pages(&args),
     }
 }
 

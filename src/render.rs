@@ -79,8 +79,16 @@ impl Summary {
         format!("error {error:.2e}{unit}{capped}")
     }
 
-    /// Writes the one line that a render ends with.
-    pub(crate) fn tell(&self, started: Instant, output: &Output) -> anyhow::Result<()> {
+    /// Writes the one line that a render ends with, unless it is quiet.
+    pub(crate) fn tell(
+        &self,
+        started: Instant,
+        output: &Output,
+        console: &Console,
+    ) -> anyhow::Result<()> {
+        if console.is_quiet() {
+            return Ok(());
+        }
         let mrays = self.tally.rays as f64 / 1e6;
         writeln!(
             io::stdout().lock(),
@@ -290,7 +298,7 @@ impl Render<'_> {
         }
         let told =
             std::mem::replace(&mut *self.told.lock().expect("nothing here panics"), Instant::now());
-        summary.tell(told, &output)?;
+        summary.tell(told, &output, self.console)?;
         if let Some(time) = self.args.time {
             let over = summary.rendering.as_secs_f64() / time.as_secs_f64() - 1.0;
             tracing::info!(

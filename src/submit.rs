@@ -99,7 +99,8 @@ pub(crate) async fn run(
     let request = args.picture.request(output.format());
     let (sampling, transfer) = (request.quality.sampling, request.transfer);
     let workers = worker_count as usize;
-    Summary { size, tally, sampling, transfer, rendering, workers }.tell(started, &output)?;
+    Summary { size, tally, sampling, transfer, rendering, workers }
+        .tell(started, &output, console)?;
     Ok(())
 }
 

@@ -6,8 +6,12 @@ use super::*;
 
 /// A farm that keeps its state, started; and its address.
 fn start_farm(place: &Place, listen: &str) -> (Process, String) {
+    start_farm_with(place, listen, &[])
+}
+
+fn start_farm_with(place: &Place, listen: &str, more: &[&str]) -> (Process, String) {
     let args = ["coordinator", "--listen", listen, "--state", "state", "--lease-seconds", "0.5"];
-    let mut coordinator = place.start("coordinator.log", &args);
+    let mut coordinator = place.start("coordinator.log", &[&args[..], more].concat());
     let line = coordinator.read_line();
     let url = line.trim().strip_prefix("listening on ").expect(&line).to_owned();
     (coordinator, url)
@@ -148,46 +152,54 @@ fn people_can_live_with_the_queue() {
     assert!(order(&place, &url).is_empty(), "it was fetched");
     worker.signal(Signal::TERM);
     worker.wait();
+    coordinator.signal(Signal::TERM);
+    coordinator.wait();
+}
 
-    // A worker that has no memory for a scene gets none of it, and its owner is told.
-    let small_args = ["worker", "--threads", "1", "--memory", "0.0000001", "--coordinator", &url];
-    let mut tiny = place.start("tiny.log", &small_args);
-    let mut submit = place.start(
-        "submit.log",
-        &[&["submit", "scene.rt", "-o", "out.png", "--coordinator", &url], &small[..]].concat(),
-    );
+#[test]
+fn a_scene_that_no_worker_can_hold_waits_and_its_owner_is_told() {
+    let place = Place::new();
+    let (_coordinator, url) = start_farm(&place, "127.0.0.1:0");
+    let tiny = ["worker", "--threads", "1", "--memory", "0.0000001", "--coordinator", &url];
+    let _tiny = place.start("tiny.log", &tiny);
+    let submit = ["submit", "scene.rt", "-o", "out.png", "--coordinator", &url];
+    let small = ["--size", "64x48", "--samples", "2"];
+    let mut submit = place.start("submit.log", &[&submit[..], &small].concat());
     poll(|| submit.log().contains("no worker can hold its scene of ").then_some(()));
     let told = ask(&place, &url, &["jobs"]).1;
     assert!(told.contains(" waits: no worker can hold its scene of "), "{told}");
-    let mut worker = start("worker.log");
+    let worker = ["worker", "--threads", "1", "--coordinator", &url];
+    let _worker = place.start("worker.log", &worker);
     assert!(submit.wait().success(), "{}", submit.log());
-    for worker in [&mut tiny, &mut worker] {
-        worker.signal(Signal::TERM);
-        worker.wait();
-    }
+}
 
-    // A tile ends three workers; the other is finished, and the job fails in part; then it is tried
-    // again.
+#[test]
+fn a_tile_that_ends_three_workers_is_set_aside_the_others_finished_and_it_is_tried_again() {
+    let place = Place::new();
+    // Workers that compare its other tile would die of that one.
+    let no_audit = ["--audit", "0"];
+    let (mut coordinator, mut url) = start_farm_with(&place, "127.0.0.1:0", &no_audit);
+    let start = || place.start("worker.log", &["worker", "--threads", "1", "--coordinator", &url]);
     let two_tiles = ["--size", "96x48", "--tile", "48", "--samples", "1024"];
-    let fourth = detach(&place, &url, &two_tiles);
+    let job = detach(&place, &url, &two_tiles);
     for _ in 0..3 {
-        let worker = start("worker.log");
+        let worker = start();
         let is_in_work = |entry: Value| entry["workers_now"] == 1 && entry["tiles_done"] == 1;
-        poll(|| is_in_work(entry(&place, &url, &fourth)).then_some(()));
+        poll(|| is_in_work(entry(&place, &url, &job)).then_some(()));
         worker.signal(Signal::KILL);
-        poll(|| (entry(&place, &url, &fourth)["workers_now"] == 0).then_some(()));
+        poll(|| (entry(&place, &url, &job)["workers_now"] == 0).then_some(()));
     }
-    let (code, _, log) = ask(&place, &url, &["watch", &fourth]);
+    let (code, _, log) = ask(&place, &url, &["watch", &job]);
     assert_eq!(code, Some(1));
     assert!(log.contains("the job failed: 1 of 2 tiles are right; set aside"), "{log}");
     coordinator.signal(Signal::TERM);
     assert!(coordinator.wait().success());
-    (coordinator, url) = start_farm(&place, url.strip_prefix("http://").unwrap());
-    assert_eq!(entry(&place, &url, &fourth)["state"], "failed");
-    json(&place, &url, &["retry", &fourth]);
+    (coordinator, url) = start_farm_with(&place, url.strip_prefix("http://").unwrap(), &no_audit);
+    assert_eq!(entry(&place, &url, &job)["state"], "failed");
+    json(&place, &url, &["retry", &job]);
     let _worker = place.start("worker.log", &["worker", "--threads", "1", "--coordinator", &url]);
-    assert_eq!(json(&place, &url, &["watch", &fourth])["state"], "finished");
-    json(&place, &url, &["image", &fourth, "-o", "out.png"]);
+    assert_eq!(json(&place, &url, &["watch", &job])["state"], "finished");
+    json(&place, &url, &["image", &job, "-o", "out.png"]);
     let here = place.render("here.png", &[&two_tiles[..], &["--workers", "0"]].concat());
     assert!(fs::read(place.path("out.png")).unwrap() == here);
     coordinator.signal(Signal::TERM);
