@@ -72,7 +72,7 @@ pub(crate) enum Command {
     /// List a farm's workers.
     Workers(FarmArgs),
     /// Follow a job to its end; exits with 1 when it fails.
-    Watch(JobArgs),
+    Watch(WatchArgs),
     /// Fetch the picture of a finished job, which the farm then forgets.
     Image(ImageArgs),
     /// End a job and forget it.
@@ -247,10 +247,11 @@ pub(crate) struct RenderArgs {
     #[command(flatten)]
     pub(crate) picture: PictureArgs,
 
-    /// Render these frames of a sequence: 1-48, or 1-48x2 for each second one. SCENE and FILE then have
-    /// a place for the number, like shot.%04d.rt. The next frame fills the workers while the last tiles
-    /// of one are rendered.
-    #[arg(long, value_name = "A-B", conflicts_with = "time")]
+    /// Render these frames of a sequence: 1-48, or 1-48x2 for each second one.
+    ///
+    /// SCENE and FILE then have a place for the number, like shot.%04d.rt. The next frame fills the
+    /// workers while the last tiles of one are rendered.
+    #[arg(long, value_name = "A-B", conflicts_with = "time", help_heading = PICTURE)]
     pub(crate) frames: Option<FrameRange>,
 
     /// Make the picture as good as this many seconds allow: a pilot chooses the --error and the
@@ -351,6 +352,12 @@ pub(crate) struct WorkerArgs {
     #[arg(long, value_name = "auto|scalar|sse2|avx2", default_value = "auto", env = "RTFARM_ISA", help_heading = WORK)]
     pub(crate) isa: IsaChoice,
 
+    /// Memory in GB for prepared scenes; a scene that needs more is left to others.
+    ///
+    /// By default three quarters of what the machine has, or of what its control group allows.
+    #[arg(long, value_name = "GB", value_parser = parse_gigabytes, env = "RTFARM_MEMORY", help_heading = WORK)]
+    memory: Option<u64>,
+
     /// How long to go on without a coordinator.
     #[arg(long, value_name = "S", default_value = "60", value_parser = parse_seconds, env = "RTFARM_PATIENCE", help_heading = WORK)]
     pub(crate) patience: Duration,
@@ -439,6 +446,20 @@ pub(crate) struct JobArgs {
 
     #[command(flatten)]
     pub(crate) farm: FarmArgs,
+}
+
+#[derive(Debug, ClapArgs)]
+pub(crate) struct WatchArgs {
+    /// The job's number.
+    #[arg(value_name = "JOB")]
+    pub(crate) job: u64,
+
+    #[command(flatten)]
+    pub(crate) farm: FarmArgs,
+
+    /// How long to go on without a coordinator once it was reached.
+    #[arg(long, value_name = "S", default_value = "60", value_parser = parse_seconds, env = "RTFARM_PATIENCE", help_heading = FARM)]
+    pub(crate) patience: Duration,
 }
 
 #[derive(Debug, ClapArgs)]
@@ -578,6 +599,14 @@ impl WorkerArgs {
     pub(crate) fn threads(&self) -> usize {
         self.threads.map_or_else(core_count, usize::from)
     }
+
+    /// Bytes for prepared scenes. A local worker takes what its parent could prepare.
+    pub(crate) fn memory(&self) -> Option<u64> {
+        match self.parent {
+            Some(_) => None,
+            None => self.memory.or_else(rtfarm_worker::memory_for_scenes),
+        }
+    }
 }
 
 impl Command {
@@ -645,6 +674,13 @@ fn parse_seconds(text: &str) -> Result<Duration, String> {
     } else {
         Err("a time is from 0.1 to 86400 seconds".to_owned())
     }
+}
+
+/// Answers with bytes.
+fn parse_gigabytes(text: &str) -> Result<u64, &'static str> {
+    let bytes = text.parse().ok().map(|gigabytes: f64| gigabytes * 1e9);
+    let bytes = bytes.filter(|bytes| (1.0..=1e18).contains(bytes));
+    bytes.map(|bytes| bytes as u64).ok_or("memory is a number of GB above 0")
 }
 
 fn parse_fraction(text: &str) -> Result<f64, &'static str> {

@@ -2,6 +2,7 @@
 //! is a table or a line for people, or one JSON document.
 
 use std::{
+    fmt::Write as _,
     io::{self, Write},
     time::Duration,
 };
@@ -14,16 +15,17 @@ use rtfarm_proto::{
     wire::{self, Standing, control_request::Change, event, jobs_client::JobsClient},
 };
 use serde_json::{Value, json};
-use tokio::time::timeout;
+use tokio::time::{Instant, sleep, timeout};
 use tokio_util::sync::CancellationToken;
 use tonic::{Status, transport::Channel};
 
 use crate::{
-    args::{FarmArgs, JobArgs},
+    args::{FarmArgs, WatchArgs},
     console::Console,
     failure::Failure,
     plain::plain,
-    submit::reach,
+    submission::{FIRST_PAUSE, LONGEST_PAUSE},
+    submit::{is_lost, reach},
 };
 
 /// The longest that a coordinator may take to answer.
@@ -166,10 +168,14 @@ fn list_jobs(jobs: &[wire::JobEntry]) -> Answer {
             job.name.clone(),
         ]
     });
-    Answer {
-        json: Value::Array(jobs.iter().map(job_json).collect()),
-        text: table(&head, rows.collect()),
+    let mut text = table(&head, rows.collect());
+    for job in jobs {
+        let obstacle = job.progress.as_ref().map_or("", |progress| &progress.obstacle);
+        if !obstacle.is_empty() {
+            let _ = writeln!(text, "job {} waits: {obstacle}", job.job);
+        }
     }
+    Answer { json: Value::Array(jobs.iter().map(job_json).collect()), text }
 }
 
 fn most_of(now: u32, most: u32) -> String {
@@ -215,12 +221,15 @@ fn progress_json(event: &wire::Event) -> Value {
         "workers": event.workers,
         "differing_tiles": event.differing_tiles,
         "failure": reason,
+        "obstacle": (!event.obstacle.is_empty()).then_some(&event.obstacle),
     })
 }
 
 fn list_workers(workers: &[wire::WorkerEntry]) -> Answer {
-    let head =
-        ["WORKER", "STANDING", "TILES", "DONE", "THREADS", "ISA", "SILENT", "PROCESS", "HOST"];
+    let head = [
+        "WORKER", "STANDING", "TILES", "DONE", "THREADS", "MEMORY", "ISA", "SILENT", "PROCESS",
+        "HOST",
+    ];
     let rows = workers.iter().map(|worker| {
         vec![
             worker.worker.to_string(),
@@ -228,6 +237,11 @@ fn list_workers(workers: &[wire::WorkerEntry]) -> Answer {
             worker.tiles_leased.to_string(),
             worker.tiles_done.to_string(),
             worker.threads.to_string(),
+            if worker.memory == 0 {
+                "-".to_owned()
+            } else {
+                format!("{:.1}GB", worker.memory as f64 / 1e9)
+            },
             worker.isa.clone(),
             format!("{:.1}s", worker.silence),
             worker.process.to_string(),
@@ -241,6 +255,7 @@ fn list_workers(workers: &[wire::WorkerEntry]) -> Answer {
             "tiles_leased": worker.tiles_leased,
             "tiles_done": worker.tiles_done,
             "threads": worker.threads,
+            "memory": (worker.memory > 0).then_some(worker.memory),
             "isa": worker.isa,
             "silent_seconds": worker.silence,
             "process": worker.process,
@@ -295,7 +310,7 @@ fn table(head: &[&str], rows: Vec<Vec<String>>) -> String {
 
 /// `rtfarm watch`: shows how far a job is until it has ended.
 pub(crate) async fn watch(
-    args: JobArgs,
+    args: WatchArgs,
     console: &Console,
     stop: &CancellationToken,
 ) -> Result<(), Failure> {
@@ -322,27 +337,79 @@ pub(crate) async fn watch(
     }
 }
 
-/// Shows what the coordinator tells of a job; answers with the last of it.
-async fn follow(args: &JobArgs, console: &Console) -> anyhow::Result<wire::Event> {
-    let mut client = connect(&args.farm.coordinator).await?;
-    let request = wire::WatchRequest { job: args.job, ..wire::WatchRequest::default() };
-    let events = timeout(DEADLINE, client.watch(request)).await.map_err(late)?;
-    let mut events = events.map_err(refused)?.into_inner();
-    let mut last = wire::Event::default();
-    let mut bar = None;
-    while let Some(event) = events.message().await.map_err(refused)? {
-        let Some(tally) = event.tally.and_then(|tally| Tally::try_from(tally).ok()) else {
-            return Err(anyhow!("the coordinator's answer makes no sense"));
+/// Follows a job to its end. A coordinator that was reached once and is gone is looked for until
+/// `--patience` is over.
+async fn follow(args: &WatchArgs, console: &Console) -> anyhow::Result<wire::Event> {
+    let mut gone_since: Option<Instant> = None;
+    let mut pause = FIRST_PAUSE;
+    let mut last = None;
+    loop {
+        let mut seen = None;
+        let gone = match watch_once(args, console, &mut seen).await {
+            Ok(last) => return Ok(last),
+            Err(Ended::Refused(error)) => return Err(error),
+            Err(Ended::Gone(error)) => error,
         };
+        if seen.is_some() {
+            (last, gone_since, pause) = (seen, None, FIRST_PAUSE);
+        }
+        let until = *gone_since.get_or_insert_with(Instant::now) + args.patience;
+        if last.is_none() || until <= Instant::now() + pause {
+            return Err(gone);
+        }
+        tracing::debug!(reason = %gone, ?pause, "looking for the coordinator again");
+        sleep(pause).await;
+        pause = LONGEST_PAUSE.min(pause * 2);
+    }
+}
+
+/// Why nothing more is told of a job.
+enum Ended {
+    /// The coordinator does not want to.
+    Refused(anyhow::Error),
+    /// It cannot be heard; it may be there again later.
+    Gone(anyhow::Error),
+}
+
+/// Shows what the coordinator tells of a job, the last of which is in `seen`; answers with its end.
+async fn watch_once(
+    args: &WatchArgs,
+    console: &Console,
+    seen: &mut Option<wire::Event>,
+) -> Result<wire::Event, Ended> {
+    let judged = |status: Status| {
+        if is_lost(&status) {
+            Ended::Gone(refused(status))
+        } else {
+            Ended::Refused(refused(status))
+        }
+    };
+    let mut client = connect(&args.farm.coordinator).await.map_err(Ended::Gone)?;
+    let request = wire::WatchRequest { job: args.job, ..wire::WatchRequest::default() };
+    let events = timeout(DEADLINE, client.watch(request)).await;
+    let events = events.map_err(|elapsed| Ended::Gone(late(elapsed)))?;
+    let mut events = events.map_err(judged)?.into_inner();
+    let mut bar = None;
+    while let Some(event) = events.message().await.map_err(judged)? {
+        let Some(tally) = event.tally.and_then(|tally| Tally::try_from(tally).ok()) else {
+            return Err(Ended::Refused(anyhow!("the coordinator's answer makes no sense")));
+        };
+        let known = seen.as_ref().map_or("", |event| &event.obstacle);
+        if event.obstacle != known && !event.obstacle.is_empty() {
+            tracing::warn!(reason = event.obstacle, "the job waits");
+        }
         bar.get_or_insert_with(|| console.start_bar(event.tile_count)).show(&Progress {
             tiles_done: event.tiles_done,
             tile_count: event.tile_count,
             tally,
             ..Progress::default()
         });
-        last = event;
+        if event.end.is_some() {
+            return Ok(event);
+        }
+        *seen = Some(event);
     }
-    Ok(last)
+    Err(Ended::Gone(anyhow!("the coordinator is gone")))
 }
 
 /// What there is to say of a picture that was fetched.

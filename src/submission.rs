@@ -14,8 +14,7 @@ use rtfarm_proto::{Address, JobId};
 
 use crate::failure::Failure;
 
-/// What the shell is to do. All but [`Action::TellReport`], [`Action::Show`] and
-/// [`Action::WarnOfDifferingTiles`] end what was being done before.
+/// What the shell is to do. All but [`Action::TellReport`], [`Action::Show`] and the warnings end what was being done before.
 #[derive(Debug)]
 pub(crate) enum Action {
     /// Reach the coordinator.
@@ -28,6 +27,8 @@ pub(crate) enum Action {
     Watch(JobId),
     /// Show the user how far the job is.
     Show(JobState),
+    /// Warn the user that the job waits, for that reason.
+    WarnOfObstacle(String),
     /// Warn the user that so many tiles had a second copy that differed from the first.
     WarnOfDifferingTiles(u32),
     /// Bring the picture and write it.
@@ -66,6 +67,8 @@ pub(crate) struct JobState {
     pub(crate) worker_count: u32,
     /// Tiles with a second copy that differed from the first.
     pub(crate) differing_tiles: u32,
+    /// Why the job does not get further, unless that may change by itself; otherwise empty.
+    pub(crate) obstacle: String,
     pub(crate) end: Option<JobEnd>,
 }
 
@@ -149,9 +152,9 @@ const CHUNK_DEADLINE: Duration = Duration::from_secs(30);
 
 /// The pause before a coordinator that is gone is looked for. It doubles each time, up to
 /// [`LONGEST_PAUSE`].
-const FIRST_PAUSE: Duration = Duration::from_millis(100);
+pub(crate) const FIRST_PAUSE: Duration = Duration::from_millis(100);
 
-const LONGEST_PAUSE: Duration = Duration::from_secs(2);
+pub(crate) const LONGEST_PAUSE: Duration = Duration::from_secs(2);
 
 /// A client's side of one job.
 #[derive(Debug)]
@@ -163,6 +166,8 @@ pub(crate) struct Submission {
     patience: Duration,
     /// The job outlives this client.
     is_detached: bool,
+    /// What the user was told last of the job's obstacle.
+    obstacle: String,
     /// When it was last heard of, if it is gone.
     gone_since: Option<Instant>,
     pause: Duration,
@@ -210,6 +215,7 @@ impl Submission {
             coordinator,
             patience,
             is_detached,
+            obstacle: String::new(),
             gone_since: None,
             pause: FIRST_PAUSE,
             stage: Stage::Ended,
@@ -278,6 +284,11 @@ impl Submission {
         let Stage::Watching { job, size } = self.stage else { return };
         (self.gone_since, self.pause) = (None, FIRST_PAUSE);
         self.actions.push_back(Action::Show(state.clone()));
+        if state.obstacle != self.obstacle {
+            self.obstacle.clone_from(&state.obstacle);
+            let warning = (!state.obstacle.is_empty()).then_some(state.obstacle.clone());
+            self.actions.extend(warning.map(Action::WarnOfObstacle));
+        }
         match state.end {
             None => {}
             Some(JobEnd::Finished(rendering)) => {
@@ -456,7 +467,16 @@ mod tests {
     fn state(end: Option<JobEnd>) -> JobState {
         let (tiles_done, tile_count) = if end.is_some() { (9, 9) } else { (4, 9) };
         let tally = Tally { rays: 5, ..Tally::default() };
-        JobState { tiles_done, tile_count, tally, worker_count: 2, differing_tiles: 0, end }
+        let obstacle = String::new();
+        JobState {
+            tiles_done,
+            tile_count,
+            tally,
+            worker_count: 2,
+            differing_tiles: 0,
+            obstacle,
+            end,
+        }
     }
 
     fn finished() -> JobEnd {
@@ -783,5 +803,20 @@ mod tests {
         bench.submission.on_trouble(Trouble::Gone, bench.now);
         bench.submission.on_tick(bench.now + SUBMIT_DEADLINE);
         bench.check_actions(&[]);
+    }
+
+    #[test]
+    fn what_a_job_waits_for_is_told_when_it_changes() {
+        let mut bench = Bench::watching();
+        bench.actions();
+        let told = |bench: &mut Bench, obstacle: &str| {
+            let obstacle = obstacle.to_owned();
+            bench.submission.on_job_state(JobState { obstacle, ..state(None) }, bench.now);
+            bench.actions().0.split_off(1)
+        };
+        assert_eq!(told(&mut bench, "too large"), ["WarnOfObstacle(\"too large\")"]);
+        assert!(told(&mut bench, "too large").is_empty());
+        assert!(told(&mut bench, "").is_empty());
+        assert_eq!(told(&mut bench, "too large").len(), 1);
     }
 }

@@ -230,6 +230,7 @@ impl Shell<'_> {
                 self.start(|reports| watch(client, request, reports));
             }
             Action::Show(state) => self.show(&state),
+            Action::WarnOfObstacle(reason) => tracing::warn!(reason, "the job waits"),
             Action::WarnOfDifferingTiles(tiles) => {
                 self.bar = None;
                 tracing::warn!(
@@ -356,10 +357,14 @@ impl Shell<'_> {
 
 /// What a call failed of: the coordinator says it, or the connection.
 fn failed(status: &Status) -> Report {
-    let is_lost = status.source().is_some()
-        || matches!(status.code(), Code::Unavailable | Code::Unknown | Code::Cancelled);
     let reason = plain(status.message());
-    Report::Trouble(if is_lost { Trouble::Lost(reason) } else { Trouble::Call(reason) })
+    Report::Trouble(if is_lost(status) { Trouble::Lost(reason) } else { Trouble::Call(reason) })
+}
+
+/// Says whether a call failed of its connection.
+pub(crate) fn is_lost(status: &Status) -> bool {
+    status.source().is_some()
+        || matches!(status.code(), Code::Unavailable | Code::Unknown | Code::Cancelled)
 }
 
 /// Reaches a coordinator.
@@ -543,6 +548,7 @@ fn read_event(event: wire::Event) -> anyhow::Result<JobState> {
         tally: Tally::try_from(event.tally.unwrap_or_default())?,
         worker_count: event.workers,
         differing_tiles: event.differing_tiles,
+        obstacle: event.obstacle,
         end,
     })
 }

@@ -22,6 +22,7 @@ pub(crate) async fn run(
     let config = Config {
         threads: args.threads(),
         isa: args.isa.0,
+        memory: args.memory(),
         patience: if is_local { LOCAL_PATIENCE } else { args.patience },
         coordinator: args.coordinator,
         version: args.claim_version,

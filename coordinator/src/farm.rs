@@ -15,7 +15,7 @@ use crate::{
     audit::Audit,
     identity::{Identity, Stranger},
     lease::{LONGEST_QUIET, Leases, Loss, Run},
-    members::{KeptOut, Members, NoMember, Process, Standing},
+    members::{KeptOut, Mark, Members, NoMember, Process, Standing},
     tiles::{Arrival, MOST_LOSSES, PixelHash, Rendering, Tiles},
     waiting::{Ask, AskId, Waiting},
 };
@@ -84,6 +84,8 @@ struct JobState {
     /// Tiles of which such pixels came: who brought the last, under which lease.
     senseless: BTreeMap<TileId, (WorkerId, LeaseId)>,
     storing: BTreeMap<TileId, Storing>,
+    /// What the tiles in the picture took that came since this start, in the order of coming.
+    tallies: Vec<(TileId, Tally)>,
     /// Tiles of which copies differ, and nobody could say which is right.
     unsettled: BTreeSet<TileId>,
 }
@@ -183,6 +185,8 @@ pub(crate) enum Action {
     Reopen(JobId),
     /// Keep the terms of a job.
     Keep(JobId, Terms),
+    /// Keep what is remembered of processes.
+    KeepMarks(BTreeMap<u64, Mark>),
     /// Forget what is kept of tiles that are not in the picture any more.
     TakeBack(JobId, Vec<TileId>),
     /// Show those who watch a job how far it is.
@@ -221,6 +225,8 @@ pub(crate) enum Notice {
     NotCompared(JobId, TileId),
     /// A job failed, for that reason.
     JobFailed(JobId, String),
+    /// A job waits for a worker that can hold its scene.
+    NoRoom(JobId, String),
     /// A client cancelled a job.
     JobCancelled(JobId),
     /// A job is forgotten, since there is no room or no time for it any more.
@@ -252,7 +258,17 @@ impl JobState {
             suspects: BTreeSet::new(),
             senseless: BTreeMap::new(),
             storing: BTreeMap::new(),
+            tallies: Vec::new(),
             unsettled: BTreeSet::new(),
+        }
+    }
+
+    /// Counts no more what tiles took that are out of the picture again.
+    fn forget_tallies(&mut self, taken: &BTreeSet<TileId>) {
+        self.tallies.retain(|(tile, _)| !taken.contains(tile));
+        self.progress.tally = self.earlier.tally;
+        for (_, tally) in &self.tallies {
+            self.progress.tally.add(tally);
         }
     }
 
@@ -350,7 +366,11 @@ impl Farm {
         now: Instant,
     ) -> (Result<WorkerId, KeptOut>, Vec<Action>) {
         match self.members.on_join(&process, now) {
-            Ok((worker, true)) => (Ok(worker), vec![Action::Log(Notice::Joined(worker, process))]),
+            Ok((worker, true)) => {
+                let mut actions = vec![Action::Log(Notice::Joined(worker, process))];
+                self.look_for_obstacles(&mut actions);
+                (Ok(worker), actions)
+            }
             Ok((worker, false)) => (Ok(worker), Vec::new()),
             Err(kept_out) => (Err(kept_out), Vec::new()),
         }
@@ -395,6 +415,7 @@ impl Farm {
         actions: &mut Vec<Action>,
     ) {
         let was_member = self.members.remove(worker);
+        self.look_for_obstacles(actions);
         if let Some(ask) = self.waiting.of(worker) {
             self.waiting.remove(ask);
             actions.push(Action::Answer(ask, Err(NoMember(worker))));
@@ -461,7 +482,8 @@ impl Farm {
         now: Instant,
     ) -> Option<Run> {
         self.members.on_sign_of_life(worker, now).ok()?;
-        if self.phase != Phase::Open || !self.may_render(worker, job) {
+        let is_on_trial = self.leases.is_on_trial(worker);
+        if self.phase != Phase::Open || is_on_trial || !self.may_render(worker, job) {
             return None;
         }
         let grid = self.leases.tiles(job)?.grid();
@@ -563,11 +585,11 @@ impl Farm {
 
     /// Says whether a worker may have tiles of a job: one under suspicion only if all are.
     fn may_render(&self, worker: WorkerId, job: JobId) -> bool {
-        let is_active = self.members.is_active(worker);
-        is_active
-            && self.jobs.get(&job).is_none_or(|JobState { suspects, .. }| {
-                !suspects.contains(&worker) || self.members.all(|member| suspects.contains(&member))
-            })
+        let Some(JobState { suspects, terms, .. }) = self.jobs.get(&job) else { return false };
+        let bytes = terms.scene_byte_count;
+        let is_suspect = |worker| suspects.contains(&worker);
+        self.members.may_hold(worker, bytes)
+            && (!is_suspect(worker) || self.members.all(bytes, is_suspect))
     }
 
     /// From when on which waiting question can be answered with a tile of which quiet lease.
@@ -728,6 +750,7 @@ impl Farm {
         self.members.on_tile(worker);
         job.progress.tiles_done = done;
         job.progress.tally.add(&delivery.tally);
+        job.tallies.push((tile, delivery.tally));
         job.progress.worker_count = job.earlier.worker_count.max(job.contributors.len() as u32);
         let (progress, elapsed) = (job.progress.clone(), job.elapsed(now));
         let mut actions = vec![Action::Acknowledge(storing.id, Verdict::Accepted)];
@@ -804,6 +827,7 @@ impl Farm {
         if is_whole {
             self.end(id, Outcome::Finished(elapsed), now, &mut actions);
         } else if self.phase == Phase::Open {
+            self.look_for_obstacles(&mut actions);
             self.serve(now, &mut actions);
         } else {
             self.fail(id, STOPPED.to_owned(), now, &mut actions);
@@ -928,6 +952,7 @@ impl Farm {
             tiles.reopen(&wrong);
             job.progress.tiles_done = tiles.done_count();
             if !wrong.is_empty() {
+                job.forget_tallies(&wrong);
                 actions.push(Action::TakeBack(id, wrong.into_iter().collect()));
             }
             job.rest = Some(tiles);

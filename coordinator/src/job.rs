@@ -126,9 +126,9 @@ impl Job {
 fn replace_older(shown: &mut Progress, progress: Progress) -> bool {
     // One of these grows with every change, and none before it shrinks.
     let age = |progress: &Progress| {
-        let Progress { tiles_done, differing_tiles, taken_back, retry_count, outcome, .. } =
-            progress;
-        (*retry_count, outcome.is_some(), *taken_back, *tiles_done, *differing_tiles)
+        let Progress { tiles_done, differing_tiles, taken_back, retry_count, .. } = *progress;
+        let has_ended = progress.outcome.is_some();
+        (retry_count, has_ended, taken_back, tiles_done, differing_tiles, progress.obstacle_count)
     };
     let is_older = age(shown) < age(&progress);
     if is_older {

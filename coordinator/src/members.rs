@@ -17,6 +17,18 @@ pub(crate) struct Process {
     pub(crate) threads: usize,
     pub(crate) host: String,
     pub(crate) isa: String,
+    /// Bytes of a prepared scene that it can hold; `None`: any number.
+    pub(crate) memory: Option<u64>,
+}
+
+/// What a farm remembers of a process though it is no member: how it was found to be, or was told to
+/// work.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Mark {
+    /// It lied, as this worker, and is kept out.
+    Liar(WorkerId),
+    /// Somebody decided that it is to be so.
+    Stationed(Standing),
 }
 
 /// A number that is no member's: it never was one, or its worker has left or was silent too long.
@@ -41,9 +53,12 @@ pub(crate) struct Members {
     checks: BTreeSet<(Instant, WorkerId)>,
     draining: BTreeSet<WorkerId>,
     threads: usize,
-    /// Liars, members once, and the nonces of their processes.
+    /// What the active members can hold.
+    memories: BTreeSet<(u64, WorkerId)>,
+    /// Liars, members once.
     liars: BTreeSet<WorkerId>,
-    kept_out: BTreeMap<u64, WorkerId>,
+    /// Processes of which something is remembered, by their nonces.
+    marks: BTreeMap<u64, Mark>,
 }
 
 /// What a worker gets to do.
@@ -80,6 +95,13 @@ struct Member {
     check_at: Instant,
 }
 
+impl Member {
+    /// Bytes of a scene that it can hold.
+    fn memory(&self) -> u64 {
+        self.process.memory.unwrap_or(u64::MAX)
+    }
+}
+
 impl Members {
     /// Makes a farm without members; one that says nothing for `longest_silence` is forgotten.
     pub(crate) fn new(longest_silence: Duration) -> Self {
@@ -92,8 +114,9 @@ impl Members {
             checks: BTreeSet::new(),
             draining: BTreeSet::new(),
             threads: 0,
+            memories: BTreeSet::new(),
             liars: BTreeSet::new(),
-            kept_out: BTreeMap::new(),
+            marks: BTreeMap::new(),
         }
     }
 
@@ -104,9 +127,11 @@ impl Members {
         process: &Process,
         now: Instant,
     ) -> Result<(WorkerId, bool), KeptOut> {
-        if let Some(&liar) = self.kept_out.get(&process.nonce) {
-            return Err(KeptOut(liar));
-        }
+        let standing = match self.marks.get(&process.nonce) {
+            Some(&Mark::Liar(liar)) => return Err(KeptOut(liar)),
+            Some(&Mark::Stationed(standing)) => standing,
+            None => Standing::Active,
+        };
         if let Some(&worker) = self.by_nonce.get(&process.nonce) {
             let is_member = self.on_sign_of_life(worker, now).is_ok();
             debug_assert!(is_member, "the index has members only");
@@ -127,6 +152,7 @@ impl Members {
         };
         self.checks.insert((member.check_at, worker));
         self.by_id.insert(worker, member);
+        self.set_standing(worker, standing);
         Ok((worker, true))
     }
 
@@ -135,8 +161,18 @@ impl Members {
     pub(crate) fn on_lie(&mut self, liar: WorkerId) {
         self.liars.insert(liar);
         if let Some(member) = self.by_id.get(&liar) {
-            self.kept_out.insert(member.process.nonce, liar);
+            self.marks.insert(member.process.nonce, Mark::Liar(liar));
         }
+    }
+
+    /// What is remembered of processes, by their nonces.
+    pub(crate) fn marks(&self) -> &BTreeMap<u64, Mark> {
+        &self.marks
+    }
+
+    /// Remembers what an earlier start of the farm did.
+    pub(crate) fn remember(&mut self, marks: BTreeMap<u64, Mark>) {
+        self.marks = marks;
     }
 
     /// Says whether a worker was found to lie.
@@ -168,8 +204,16 @@ impl Members {
         self.by_process.remove(&(member.process.number, worker));
         self.checks.remove(&(member.check_at, worker));
         self.draining.remove(&worker);
+        self.memories.remove(&(member.memory(), worker));
         self.threads -= member.process.threads;
         true
+    }
+
+    /// Event: a worker goes home that was drained: its process will not come again.
+    pub(crate) fn on_drained(&mut self, worker: WorkerId) {
+        if let Some(member) = self.by_id.get(&worker) {
+            self.marks.remove(&member.process.nonce);
+        }
     }
 
     /// Event: time passes. Answers with members that have been silent for too long; the caller
@@ -207,10 +251,15 @@ impl Members {
         self.by_process.range(of_process).next().map(|&(_, worker)| worker)
     }
 
-    /// Says whether something is true of every active member.
-    pub(crate) fn all(&self, is_true: impl Fn(WorkerId) -> bool) -> bool {
-        let active = self.by_id.iter().filter(|(_, member)| member.standing == Standing::Active);
-        active.map(|(&worker, _)| worker).all(is_true)
+    /// Says whether something is true of every active member that can hold a scene of so many bytes.
+    pub(crate) fn all(&self, bytes: u64, is_true: impl Fn(WorkerId) -> bool) -> bool {
+        self.memories.range((bytes, WorkerId(0))..).all(|&(_, worker)| is_true(worker))
+    }
+
+    /// The bytes of the largest scene that an active member can hold; `None` when there is no such
+    /// member.
+    pub(crate) fn most_memory(&self) -> Option<u64> {
+        self.memories.last().map(|&(memory, _)| memory)
     }
 
     /// Event: somebody decides what a worker is to get.
@@ -219,18 +268,36 @@ impl Members {
         worker: WorkerId,
         standing: Standing,
     ) -> Result<(), NoMember> {
-        self.by_id.get_mut(&worker).ok_or(NoMember(worker))?.standing = standing;
+        let nonce = self.by_id.get(&worker).ok_or(NoMember(worker))?.process.nonce;
+        if standing == Standing::Active {
+            self.marks.remove(&nonce);
+        } else {
+            self.marks.insert(nonce, Mark::Stationed(standing));
+        }
+        self.set_standing(worker, standing);
+        Ok(())
+    }
+
+    fn set_standing(&mut self, worker: WorkerId, standing: Standing) {
+        let Some(member) = self.by_id.get_mut(&worker) else { return };
+        member.standing = standing;
         if standing == Standing::Draining {
             self.draining.insert(worker);
         } else {
             self.draining.remove(&worker);
         }
-        Ok(())
+        let memory = (member.memory(), worker);
+        if standing == Standing::Active {
+            self.memories.insert(memory);
+        } else {
+            self.memories.remove(&memory);
+        }
     }
 
-    /// Says whether a worker is a member that gets tiles.
-    pub(crate) fn is_active(&self, worker: WorkerId) -> bool {
-        self.by_id.get(&worker).is_some_and(|member| member.standing == Standing::Active)
+    /// Says whether a worker is a member that gets tiles, and can hold a scene of so many bytes.
+    pub(crate) fn may_hold(&self, worker: WorkerId, bytes: u64) -> bool {
+        let member = self.by_id.get(&worker);
+        member.is_some_and(|member| member.standing == Standing::Active && member.memory() >= bytes)
     }
 
     /// The members that are to go home.
@@ -279,6 +346,9 @@ impl Members {
         let is_draining = |member: &Member| member.standing == Standing::Draining;
         let draining = members().filter(|(_, member)| is_draining(member)).map(|(&id, _)| id);
         assert!(self.draining == draining.collect());
+        let is_active = |member: &Member| member.standing == Standing::Active;
+        let active = members().filter(|(_, member)| is_active(member));
+        assert!(self.memories == active.map(|(&id, member)| (member.memory(), id)).collect());
         assert!(self.checks == members().map(|(&id, member)| (member.check_at, id)).collect());
         assert!(
             members()
@@ -340,6 +410,49 @@ mod tests {
         assert_eq!((members.in_process(7), members.in_process(8)), (Some(first), None));
         members.remove(first);
         assert_eq!(members.in_process(7), Some(second));
+    }
+
+    #[test]
+    fn what_somebody_decided_of_a_worker_outlives_its_membership_and_the_farm() {
+        let (mut members, now) = farm();
+        let (first, _) = members.on_join(&process(1), now).unwrap();
+        let (drained, _) = members.on_join(&process(2), now).unwrap();
+        members.on_station(first, Standing::Disabled).unwrap();
+        members.on_station(drained, Standing::Draining).unwrap();
+        assert!(members.remove(first));
+        let (again, is_new) = members.on_join(&process(1), now).unwrap();
+        assert!(is_new && again != first && !members.may_hold(again, 0));
+        members.check();
+
+        let (mut later, now) = farm();
+        later.remember(members.marks().clone());
+        let (again, _) = later.on_join(&process(1), now).unwrap();
+        assert!(!later.may_hold(again, 0));
+        later.on_station(again, Standing::Active).unwrap();
+        later.remove(again);
+        let (again, _) = later.on_join(&process(1), now).unwrap();
+        assert!(later.may_hold(again, 0));
+        let (again, _) = later.on_join(&process(2), now).unwrap();
+        assert_eq!(later.draining().collect::<Vec<_>>(), [again]);
+        later.on_drained(again);
+        assert!(later.marks().is_empty());
+        later.check();
+    }
+
+    #[test]
+    fn a_member_holds_what_it_has_memory_for() {
+        let (mut members, now) = farm();
+        assert_eq!(members.most_memory(), None);
+        let small = Process { memory: Some(100), ..process(1) };
+        let (small, _) = members.on_join(&small, now).unwrap();
+        assert!(members.may_hold(small, 100) && !members.may_hold(small, 101));
+        assert_eq!(members.most_memory(), Some(100));
+        let (large, _) = members.on_join(&process(2), now).unwrap();
+        assert!(members.all(101, |worker| worker == large));
+        assert!(!members.all(100, |worker| worker == large));
+        members.on_station(large, Standing::Disabled).unwrap();
+        assert_eq!(members.most_memory(), Some(100));
+        members.check();
     }
 
     #[test]

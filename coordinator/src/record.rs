@@ -1,5 +1,7 @@
 //! What a farm's state says of a job and of the farm, as it stands in files.
 
+use std::collections::BTreeMap;
+
 use prost::Message;
 use rtfarm_core::{
     prepared::SceneHash,
@@ -10,9 +12,11 @@ use rtfarm_core::{
 use rtfarm_job::{Outcome, Progress};
 use rtfarm_picture::PictureFormat;
 use rtfarm_proto::{
-    WireError, scene_hash, transfer,
+    WireError, WorkerId, scene_hash, transfer,
     wire::{self, event},
 };
+
+use crate::members::{Mark, Standing};
 
 /// What a file begins with that holds a record; then comes the record's hash, then the record.
 const MAGIC: [u8; 8] = *b"rtfarm 1";
@@ -26,6 +30,22 @@ pub(crate) struct FarmRecord {
     /// The last number that was given to a job.
     #[prost(uint64, tag = "2")]
     pub(crate) last_job: u64,
+    /// Processes that are kept out, drained or disabled.
+    #[prost(message, repeated, tag = "3")]
+    pub(crate) processes: Vec<ProcessRecord>,
+}
+
+/// What is remembered of a process.
+#[derive(Clone, PartialEq, Message)]
+pub(crate) struct ProcessRecord {
+    #[prost(fixed64, tag = "1")]
+    pub(crate) nonce: u64,
+    /// The worker as which it lied; 0 if it did not.
+    #[prost(uint32, tag = "2")]
+    pub(crate) liar: u32,
+    /// What it gets, if it did not.
+    #[prost(enumeration = "wire::Standing", tag = "3")]
+    pub(crate) standing: i32,
 }
 
 /// A job. A field that is added later has its default in records that lack it.
@@ -118,6 +138,38 @@ pub(crate) fn unseal<M: Message + Default>(bytes: &[u8]) -> Result<M, RecordErro
     Ok(M::decode(record)?)
 }
 
+impl FarmRecord {
+    /// What is remembered of processes, by their nonces.
+    pub(crate) fn marks(&self) -> BTreeMap<u64, Mark> {
+        let mark = |process: &ProcessRecord| match (process.liar, process.standing()) {
+            (0, wire::Standing::Draining) => Mark::Stationed(Standing::Draining),
+            (0, wire::Standing::Disabled) => Mark::Stationed(Standing::Disabled),
+            (0, _) => Mark::Stationed(Standing::Active),
+            (liar, _) => Mark::Liar(WorkerId(liar)),
+        };
+        self.processes.iter().map(|process| (process.nonce, mark(process))).collect()
+    }
+}
+
+impl ProcessRecord {
+    pub(crate) fn new((&nonce, mark): (&u64, &Mark)) -> Self {
+        let (liar, standing) = match *mark {
+            Mark::Liar(WorkerId(liar)) => (liar, wire::Standing::Unspecified),
+            Mark::Stationed(standing) => (0, to_standing(standing)),
+        };
+        Self { nonce, liar, standing: standing.into() }
+    }
+}
+
+/// What a worker gets, for messages and records.
+pub(crate) fn to_standing(standing: Standing) -> wire::Standing {
+    match standing {
+        Standing::Active => wire::Standing::Active,
+        Standing::Draining => wire::Standing::Draining,
+        Standing::Disabled => wire::Standing::Disabled,
+    }
+}
+
 impl JobRecord {
     pub(crate) fn new(ticket: &Ticket, build: &str, plan: &Plan) -> Self {
         let &Plan { scene, scene_byte_count, settings, grid, format, transfer } = plan;
@@ -175,6 +227,7 @@ pub(crate) fn to_event(progress: &Progress) -> wire::Event {
         tally: Some(progress.tally.into()),
         workers: progress.worker_count,
         differing_tiles: progress.differing_tiles,
+        obstacle: progress.obstacle.clone().unwrap_or_default(),
         end: progress.outcome.as_ref().map(|outcome| match outcome {
             Outcome::Finished(time) => {
                 event::End::Finished(wire::Finished { seconds: time.as_secs_f64() })

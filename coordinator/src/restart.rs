@@ -2,6 +2,7 @@
 //! then the next one, on a good disk.
 
 use std::{
+    collections::BTreeMap,
     io::Cursor,
     path::{Path, PathBuf},
     sync::Arc,
@@ -22,7 +23,7 @@ use crate::{
     farm::{Delivery, Keeping, Next, Verdict},
     identity::Identity,
     job::Job,
-    members::Process,
+    members::{KeptOut, Mark, Process, Standing},
     record::Ticket,
     shell::{Config, Shell},
     state::{Durability, StateError, StateFolder},
@@ -283,6 +284,30 @@ async fn a_foreign_a_used_and_a_damaged_folder_are_refused_and_left_alone() {
         std::fs::write(&file, good).unwrap();
     }
     assert_eq!(open(&path, BUILD).unwrap().kept.len(), 2, "all is well again");
+}
+
+#[test]
+fn what_is_known_of_workers_outlives_the_coordinator() {
+    let folder = TempDir::new().unwrap();
+    let path = folder.path().join("state");
+    let state = open(&path, BUILD).unwrap();
+    assert!(state.marks().is_empty());
+    let marks = BTreeMap::from([
+        (5, Mark::Liar(WorkerId(7))),
+        (2, Mark::Stationed(Standing::Draining)),
+        (u64::MAX, Mark::Stationed(Standing::Disabled)),
+    ]);
+    state.keep_marks(&marks).unwrap();
+    drop(state);
+    let state = open(&path, BUILD).unwrap();
+    assert_eq!(state.marks(), marks);
+    drop(state);
+    let farm = Coordinator::open(Disk::default(), &path, Durability::Second).unwrap();
+    let process = Process { nonce: 5, ..Process::default() };
+    assert_eq!(farm.shell.join(process), Err(KeptOut(WorkerId(7))));
+    farm.shell.submit(order(), Ticket::default()).unwrap();
+    drop(farm);
+    assert_eq!(open(&path, BUILD).unwrap().marks(), marks, "numbers of jobs stand beside them");
 }
 
 #[tokio::test]

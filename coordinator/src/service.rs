@@ -41,7 +41,7 @@ use crate::{
     job::Job,
     lease::Run,
     members::{MemberEntry, NoMember, Process, Standing},
-    record::{Ticket, to_event},
+    record::{Ticket, to_event, to_standing},
     shell::{ChangeError, Config, Shell},
     tiles::PixelHash,
 };
@@ -97,9 +97,10 @@ impl farm_server::Farm for FarmService {
         let request = request.into_inner();
         check_version("worker", &request.version, request.protocol, &self.shell)?;
         check_pixels_of(&request, &self.shell)?;
-        let wire::JoinRequest { nonce, threads, isa, host, process, .. } = request;
-        let threads = threads as usize;
-        let worker = self.shell.join(Process { nonce, number: process, threads, host, isa });
+        let wire::JoinRequest { nonce, threads, isa, host, process, memory, .. } = request;
+        let (threads, memory) = (threads as usize, (memory > 0).then_some(memory));
+        let process = Process { nonce, number: process, threads, host, isa, memory };
+        let worker = self.shell.join(process);
         let worker = worker.map_err(|error| Status::failed_precondition(error.to_string()))?;
         let term_ms = u32::try_from(self.shell.config.term.as_millis()).unwrap_or(u32::MAX);
         Ok(Response::new(wire::JoinResponse {
@@ -486,19 +487,15 @@ fn to_job_entry(entry: &JobEntry, job: &Job) -> wire::JobEntry {
 
 fn to_worker_entry((entry, tiles_leased): (MemberEntry, usize)) -> wire::WorkerEntry {
     let MemberEntry { worker, process, standing, tiles_done, silence } = entry;
-    let Process { number, threads, host, isa, .. } = process;
-    let standing = match standing {
-        Standing::Active => wire::Standing::Active,
-        Standing::Draining => wire::Standing::Draining,
-        Standing::Disabled => wire::Standing::Disabled,
-    };
+    let Process { number, threads, host, isa, memory, .. } = process;
     wire::WorkerEntry {
         worker: worker.0,
         host,
         process: number,
         threads: threads as u32,
         isa,
-        standing: standing.into(),
+        standing: to_standing(standing).into(),
+        memory: memory.unwrap_or(0),
         tiles_leased: tiles_leased as u32,
         tiles_done,
         silence: silence.as_secs_f64(),

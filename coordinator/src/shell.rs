@@ -29,7 +29,7 @@ use crate::{
     identity::{Identity, Stranger},
     job::Job,
     lease::Run,
-    members::{KeptOut, MemberEntry, NoMember, Process, Standing},
+    members::{KeptOut, Mark, MemberEntry, NoMember, Process, Standing},
     record::{Plan, Ticket},
     state::{Durability, KeptJob, StateFolder},
     store::SceneFile,
@@ -151,10 +151,11 @@ enum Work {
     Log(Box<Notice>),
     /// Writes tiles into a job's picture.
     Store(Arc<Job>, Vec<(TileId, Bytes, TileRecord)>),
-    /// Forgets what is kept of tiles.
-    TakeBack(Arc<Job>, Vec<TileId>),
+    /// Tells the machine that a job's picture cannot be written.
+    Fail(JobId, String),
     Reopen(Arc<Job>),
     Keep(Arc<Job>, Terms),
+    KeepMarks(BTreeMap<u64, Mark>),
     /// Removes the files of a job that nobody else has in hand.
     Drop(Arc<Job>),
 }
@@ -187,6 +188,7 @@ impl Shell {
             None => Farm::new(identity, config.term, audit),
         };
         farm.keep(config.keeping);
+        farm.remember(folder.as_ref().map(StateFolder::marks).unwrap_or_default());
         let kept = folder.as_mut().map(|folder| std::mem::take(&mut folder.kept));
         let state = State {
             farm,
@@ -282,8 +284,12 @@ impl Shell {
                 }
             }
             Action::TakeBack(job, tiles) => {
-                let job = state.jobs.get(&job).cloned();
-                works.in_order.extend(job.map(|job| Work::TakeBack(job, tiles)));
+                // At once, though it writes: what comes of these tiles next must not be cleared. It is rare.
+                if let Some(known) = state.jobs.get(&job)
+                    && let Err(error) = known.canvas.clear(&tiles)
+                {
+                    works.in_order.push(Work::Fail(job, error.to_string()));
+                }
             }
             Action::Reopen(job) => {
                 works.in_order.extend(state.jobs.get(&job).cloned().map(Work::Reopen));
@@ -292,6 +298,7 @@ impl Shell {
                 let job = state.jobs.get(&job).cloned();
                 works.in_order.extend(job.map(|job| Work::Keep(job, terms)));
             }
+            Action::KeepMarks(marks) => works.in_order.push(Work::KeepMarks(marks)),
             Action::Forget(job) => {
                 works.in_order.extend(state.jobs.remove(&job).map(Work::Drop));
             }
@@ -306,12 +313,14 @@ impl Shell {
             Work::Drop(job) => job.forget(),
             Work::Reopen(job) => job.reopen(),
             Work::Keep(job, terms) => job.keep(terms),
-            Work::TakeBack(job, tiles) => {
-                if let Err(error) = job.canvas.clear(&tiles) {
-                    self.tell_farm(|farm, now| {
-                        farm.on_store_failed(job.id, error.to_string(), now)
-                    });
+            Work::KeepMarks(marks) => {
+                let kept = self.folder.as_ref().map(|folder| folder.keep_marks(&marks));
+                if let Some(Err(error)) = kept {
+                    tracing::error!(reason = %error, "cannot keep what is known of workers");
                 }
+            }
+            Work::Fail(job, reason) => {
+                self.tell_farm(|farm, now| farm.on_store_failed(job, reason, now));
             }
             Work::Store(job, tiles) => {
                 let put = tiles.iter().map(|&(tile, ref bytes, record)| CanvasTile {
@@ -674,8 +683,8 @@ impl Shell {
 /// What the machine knows of a job besides its tiles.
 fn terms_of(job: &Job, is_paused: bool, is_foreign: bool) -> Terms {
     let Ticket { priority, most_workers, .. } = job.ticket;
-    let byte_count = job.byte_count();
-    Terms { priority, is_paused, most_workers, byte_count, is_foreign }
+    let (byte_count, scene_byte_count) = (job.byte_count(), job.scene.byte_count());
+    Terms { priority, is_paused, most_workers, scene_byte_count, byte_count, is_foreign }
 }
 
 /// A picture's tiles, of which some are done, and what was done so far.
@@ -832,6 +841,7 @@ fn log(notice: Notice) {
         Notice::Stationed(worker, standing) => {
             tracing::info!(worker = worker.0, ?standing, "worker's standing changed");
         }
+        Notice::NoRoom(job, reason) => tracing::warn!(job = job.0, reason, "job waits"),
         Notice::JobCancelled(job) => tracing::info!(job = job.0, "job cancelled"),
     }
 }

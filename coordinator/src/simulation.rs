@@ -286,7 +286,7 @@ impl World {
                 Action::Log(Notice::NotCompared(job, _)) => {
                     self.not_compared.insert(job);
                 }
-                Action::Log(_) => {}
+                Action::Log(_) | Action::KeepMarks(_) => {}
                 Action::Reopen(_) | Action::Keep(..) => panic!("nobody changes jobs here"),
                 Action::Stop => self.has_stopped = true,
             }

@@ -12,6 +12,7 @@
 //! anything in it goes: one with another name than a number is what a killed process left.
 
 use std::{
+    collections::BTreeMap,
     fs::{self, DirBuilder, File},
     io::{self, Read, Write},
     os::unix::fs::DirBuilderExt,
@@ -33,7 +34,10 @@ use rustix::{
 };
 
 use crate::{
-    record::{FarmRecord, JobRecord, Plan, RecordError, Ticket, seal, to_progress, unseal},
+    members::Mark,
+    record::{
+        FarmRecord, JobRecord, Plan, ProcessRecord, RecordError, Ticket, seal, to_progress, unseal,
+    },
     store::SceneFile,
 };
 
@@ -82,7 +86,8 @@ pub struct StateFolder {
     path: PathBuf,
     _lock: File,
     farm: FarmId,
-    last_job: Mutex<u64>,
+    /// What is kept of the farm.
+    record: Mutex<FarmRecord>,
     build: String,
     pub(crate) durability: Durability,
     disk: Disk,
@@ -161,7 +166,7 @@ impl StateFolder {
             path: path.to_owned(),
             _lock: lock,
             farm,
-            last_job: Mutex::new(record.last_job),
+            record: Mutex::new(record),
             build: build.to_owned(),
             durability,
             disk,
@@ -177,7 +182,17 @@ impl StateFolder {
 
     /// The last number that was given to a job.
     pub(crate) fn last_job(&self) -> JobId {
-        JobId(*self.last_job.lock().expect("writing never panics"))
+        JobId(self.record.lock().expect("writing never panics").last_job)
+    }
+
+    /// What is remembered of processes, by their nonces.
+    pub(crate) fn marks(&self) -> BTreeMap<u64, Mark> {
+        self.record.lock().expect("writing never panics").marks()
+    }
+
+    /// Keeps what is remembered of processes.
+    pub(crate) fn keep_marks(&self, marks: &BTreeMap<u64, Mark>) -> io::Result<()> {
+        self.change(|record| record.processes = marks.iter().map(ProcessRecord::new).collect())
     }
 
     /// The jobs, the earliest first. What a killed process left is removed.
@@ -280,10 +295,15 @@ impl StateFolder {
 
     /// Makes sure that a number is never given again.
     fn keep_number(&self, id: JobId) -> io::Result<()> {
-        let mut last = self.last_job.lock().expect("writing never panics");
-        let record = FarmRecord { farm: self.farm.0.to_vec(), last_job: id.0.max(*last) };
+        self.change(|record| record.last_job = id.0.max(record.last_job))
+    }
+
+    fn change(&self, change: impl FnOnce(&mut FarmRecord)) -> io::Result<()> {
+        let mut kept = self.record.lock().expect("writing never panics");
+        let mut record = kept.clone();
+        change(&mut record);
         self.disk.replace(&self.path.join(FARM), &seal(&record))?;
-        *last = record.last_job;
+        *kept = record;
         Ok(())
     }
 
@@ -347,7 +367,7 @@ fn lock(folder: &Path, disk: &Disk) -> Result<File, StateError> {
 fn new_farm() -> io::Result<FarmRecord> {
     let mut farm = vec![0; 16];
     rustix::rand::getrandom(&mut farm, rustix::rand::GetRandomFlags::empty())?;
-    Ok(FarmRecord { farm, last_job: 0 })
+    Ok(FarmRecord { farm, ..FarmRecord::default() })
 }
 
 fn read_record<M: prost::Message + Default>(path: &Path) -> Result<M, StateError> {

@@ -643,6 +643,7 @@ impl World {
                 version: "1".to_owned(),
                 build: "build".to_owned(),
                 reference: None,
+                memory: None,
                 patience: Duration::from_secs(60),
             };
             let net = Net { world: Arc::clone(&self), host };

@@ -1,6 +1,10 @@
 //! The coordinator as its workers and clients meet it: real gRPC, workers that misbehave.
 
-use std::time::Duration;
+use std::{
+    sync::{Arc, Mutex},
+    task::{Context, Poll},
+    time::Duration,
+};
 
 use rtfarm_coordinator::{Config, Coordinator, Keeping, Listener};
 use rtfarm_core::{
@@ -15,9 +19,15 @@ use rtfarm_proto::{
         submit_request::Part, submit_response::Outcome,
     },
 };
+use rtfarm_worker::simulation::{Outside, run_in};
 use tempfile::TempDir;
 use tokio::net::TcpListener;
-use tonic::{Code, transport::Channel};
+use tonic::{
+    Code,
+    body::Body,
+    codegen::{Service, http},
+    transport::Channel,
+};
 
 /// Nothing before the eye: a scene all the same.
 const SCENE: &str = "viewport\norigin 0 0 -2\ntopleft -1 1 0\nbottomleft -1 -1 0\ntopright 1 1 0\n\
@@ -474,4 +484,88 @@ async fn who_never_joined_brings_no_pixels() {
     assert_eq!(farm.state().await.tiles_done, 0);
     farm.worker = member;
     assert_eq!(farm.deliver(lease, tiles[0], 0.5).await, Ok(wire::Verdict::Accepted));
+}
+
+/// A connection to a coordinator, by its number, that notes what is called over it.
+#[derive(Clone)]
+struct Noted {
+    channel: Channel,
+    number: usize,
+    calls: Arc<Mutex<Vec<(usize, String)>>>,
+}
+
+impl Service<http::Request<Body>> for Noted {
+    type Response = http::Response<Body>;
+    type Error = tonic::transport::Error;
+    type Future = <Channel as Service<http::Request<Body>>>::Future;
+
+    fn poll_ready(&mut self, context: &mut Context<'_>) -> Poll<Result<(), Self::Error>> {
+        Service::poll_ready(&mut self.channel, context)
+    }
+
+    fn call(&mut self, request: http::Request<Body>) -> Self::Future {
+        self.calls.lock().unwrap().push((self.number, request.uri().path().to_owned()));
+        Service::call(&mut self.channel, request)
+    }
+}
+
+/// A worker's surroundings, whose connections are noted.
+struct Surroundings {
+    connection_count: Mutex<usize>,
+    calls: Arc<Mutex<Vec<(usize, String)>>>,
+}
+
+impl Outside for Surroundings {
+    type Connection = Noted;
+
+    async fn connect(&self, address: &Address) -> Result<Noted, String> {
+        let channel = address.connect().await.map_err(|error| error.to_string())?;
+        let mut number = self.connection_count.lock().unwrap();
+        *number += 1;
+        Ok(Noted { channel, number: *number, calls: Arc::clone(&self.calls) })
+    }
+
+    fn render(&self, work: impl FnOnce(tokio::time::Instant) + Send + 'static) {
+        work(tokio::time::Instant::now());
+    }
+
+    async fn block<T: Send + 'static>(&self, work: impl FnOnce() -> T + Send + 'static) -> T {
+        work()
+    }
+}
+
+#[tokio::test]
+async fn a_scene_comes_over_a_connection_of_its_own() {
+    let mut farm = Farm::new().await;
+    let calls = Arc::default();
+    let surroundings =
+        Surroundings { connection_count: Mutex::default(), calls: Arc::clone(&calls) };
+    let config = rtfarm_worker::Config {
+        coordinator: farm.address.clone(),
+        threads: 1,
+        isa: rtfarm_core::isa::Isa::Scalar,
+        version: VERSION.to_owned(),
+        build: BUILD.to_owned(),
+        reference: Some(REFERENCE),
+        memory: None,
+        patience: Duration::from_secs(5),
+    };
+    let worker = tokio::spawn(run_in(surroundings, config, 1, std::future::pending()));
+    let request = wire::WatchRequest { job: farm.job, farm: farm.named.clone() };
+    let mut events = farm.jobs.watch(request).await.unwrap().into_inner();
+    while let Some(event) = events.message().await.unwrap() {
+        if event.end.is_some() {
+            assert!(matches!(event.end, Some(End::Finished(_))), "{event:?}");
+            break;
+        }
+    }
+    worker.abort();
+    let calls: Vec<(usize, String)> = std::mem::take(&mut calls.lock().unwrap());
+    let connections = |name: &str| -> Vec<usize> {
+        let of_name = calls.iter().filter(|(_, path)| path.ends_with(name));
+        of_name.map(|(connection, _)| *connection).collect()
+    };
+    assert_eq!(connections("/Fetch"), [2], "{calls:?}");
+    assert!(connections("/Deliver").iter().all(|&connection| connection == 1), "{calls:?}");
+    assert!(!connections("/Deliver").is_empty());
 }

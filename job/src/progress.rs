@@ -21,6 +21,10 @@ pub struct Progress {
     pub taken_back: u32,
     /// How often it was tried again after it had failed.
     pub retry_count: u32,
+    /// Why it does not get further, unless that may change by itself.
+    pub obstacle: Option<String>,
+    /// How often that changed.
+    pub obstacle_count: u32,
     /// How it ended, once it has.
     pub outcome: Option<Outcome>,
 }

@@ -173,10 +173,18 @@ impl Canvas {
         Ok(records.write(recorded)?)
     }
 
-    /// Forgets the records of tiles: what was put of them is not what the picture is to show.
-    pub fn clear(&self, tiles: &[TileId]) -> io::Result<()> {
-        let Some(records) = &self.records else { return Ok(()) };
-        records.write(tiles.iter().map(|&tile| (tile, [0; RECORD_BYTES])).collect())
+    /// Takes tiles out of the picture, which is black there then: what was put of them is not what it is
+    /// to show.
+    pub fn clear(&self, tiles: &[TileId]) -> Result<(), PutError> {
+        if let Some(records) = &self.records {
+            records.write(tiles.iter().map(|&tile| (tile, [0; RECORD_BYTES])).collect())?;
+        }
+        let areas = tiles.iter().map(|&tile| self.grid.area(tile));
+        for area in areas {
+            let black = vec![[0.0; 3]; area.pixel_count()];
+            self.picture.put(area, &black)?;
+        }
+        Ok(())
     }
 
     /// Makes what was put so far outlive a power cut.
@@ -368,7 +376,11 @@ mod tests {
         check_done(folder.path(), &put);
         let canvas = Canvas::open(folder.path(), grid(), FORMAT, SUBJECT, &Disk::default());
         let taken_back = put.pop().unwrap();
-        canvas.unwrap().clear(&[taken_back]).unwrap();
+        let canvas = canvas.unwrap();
+        let shown = || canvas.picture().read_area(grid().area(taken_back)).unwrap();
+        assert!(shown().iter().any(|&byte| byte != 0));
+        canvas.clear(&[taken_back]).unwrap();
+        assert!(shown().iter().all(|&byte| byte == 0), "it is black");
         check_done(folder.path(), &put);
         for byte in [0, 1, 20, 100, 127] {
             damage(RECORDS, byte);

@@ -25,7 +25,7 @@ pub mod wire {
 }
 
 /// The version of `farm.proto`. Both sides must have the same, and the same package version.
-pub const PROTOCOL: u32 = 10;
+pub const PROTOCOL: u32 = 11;
 
 /// The largest message that either side takes: a tile of the largest side, 12 bytes a pixel, and
 /// room for what stands around it.

@@ -3,6 +3,7 @@
 
 mod faults;
 mod frames;
+mod liar;
 mod queue;
 
 use std::{
@@ -20,7 +21,7 @@ use rustix::process::{Pid, Signal, kill_process, test_kill_process};
 use tempfile::TempDir;
 
 /// A picture that takes one thread some seconds, cut into this many tiles.
-const SLOW: [&str; 6] = ["--size", "320x240", "--samples", "1024", "--tile", "16"];
+const SLOW: [&str; 6] = ["--size", "160x120", "--samples", "1024", "--tile", "8"];
 const SLOW_TILE_COUNT: usize = 20 * 15;
 
 /// How long anything here may take.
@@ -416,7 +417,7 @@ fn a_coordinator_killed_and_started_again_gives_the_next_picture_no_pixel_of_the
     // The same grid of tiles, other pixels.
     let other = scene_text().replace("color 230 60 40", "color 40 60 230");
     fs::write(place.path("other.rt"), other).unwrap();
-    let quick = [&["--samples", "64"], &["--size", "320x240", "--tile", "16"][..]].concat();
+    let quick = ["--samples", "64", SLOW[0], SLOW[1], SLOW[4], SLOW[5]];
     let render = [&["render", "other.rt", "-o", "here.png", "--workers", "0"], &quick[..]].concat();
     let mut here = place.start("here.log", &render);
     assert!(here.wait().success(), "{}", here.log());

@@ -6,8 +6,12 @@ use super::*;
 
 /// A farm that keeps its state, started; and its address.
 fn start_farm(place: &Place, listen: &str) -> (Process, String) {
+    start_farm_with(place, listen, &[])
+}
+
+fn start_farm_with(place: &Place, listen: &str, more: &[&str]) -> (Process, String) {
     let args = ["coordinator", "--listen", listen, "--state", "state", "--lease-seconds", "0.5"];
-    let mut coordinator = place.start("coordinator.log", &args);
+    let mut coordinator = place.start("coordinator.log", &[&args[..], more].concat());
     let line = coordinator.read_line();
     let url = line.trim().strip_prefix("listening on ").expect(&line).to_owned();
     (coordinator, url)
@@ -78,10 +82,17 @@ fn people_can_live_with_the_queue() {
     assert_eq!(json(&place, &url, &["priority", &second, "5"])["priority"], 5);
     assert_eq!(order(&place, &url), [&second[..], &first]);
     assert_eq!(json(&place, &url, &["pause", &second])["paused"], true);
+    let mut watch = place.start("watch.log", &["watch", &second, "--coordinator", &url]);
+    let impatient = ["watch", &second, "--patience", "0.1", "--coordinator", &url];
+    let mut impatient = place.start("impatient.log", &impatient);
+    // Both hear of the job before its coordinator goes.
+    thread::sleep(Duration::from_millis(300));
 
     // All of it outlives the coordinator.
     coordinator.signal(Signal::KILL);
     coordinator.wait();
+    assert_eq!(impatient.wait().code(), Some(1));
+    assert!(impatient.log().contains("error: "), "{}", impatient.log());
     (coordinator, url) = start_farm(&place, url.strip_prefix("http://").unwrap());
     assert_eq!(order(&place, &url), [&second[..], &first]);
     let of_second = entry(&place, &url, &second);
@@ -99,7 +110,7 @@ fn people_can_live_with_the_queue() {
     assert!(log.contains("the job has not finished"), "{log}");
     json(&place, &url, &["image", &first, "-o", "early.png", "--partial"]);
     let early = image::open(place.path("early.png")).unwrap();
-    assert_eq!((early.width(), early.height()), (320, 240));
+    assert_eq!((early.width(), early.height()), (160, 120));
     json(&place, &url, &["cancel", &first]);
     assert_eq!(order(&place, &url), [&second[..]]);
     for unknown in [&["cancel", &first[..]][..], &["pause", &first], &["watch", &first]] {
@@ -115,7 +126,10 @@ fn people_can_live_with_the_queue() {
     assert_eq!(json(&place, &url, &["drain", &number])["standing"], "draining");
     assert!(worker.wait().success(), "{}", worker.log());
     assert_eq!(json(&place, &url, &["workers"]), Value::Array(Vec::new()));
+    assert!(watch.child.try_wait().unwrap().is_none(), "it is watched still");
     json(&place, &url, &["cancel", &second]);
+    assert_eq!(watch.wait().code(), Some(1));
+    assert!(watch.log().contains("the job failed: it was cancelled"), "{}", watch.log());
 
     // A worker that is disabled gets nothing, until it is enabled.
     let small = ["--size", "64x48", "--samples", "2"];
@@ -138,28 +152,55 @@ fn people_can_live_with_the_queue() {
     assert!(order(&place, &url).is_empty(), "it was fetched");
     worker.signal(Signal::TERM);
     worker.wait();
+    coordinator.signal(Signal::TERM);
+    coordinator.wait();
+}
 
-    // A tile ends three workers, and its job with them; then it is tried again.
-    let one_tile = ["--size", "48x48", "--tile", "48", "--samples", "2048"];
-    let fourth = detach(&place, &url, &one_tile);
+#[test]
+fn a_scene_that_no_worker_can_hold_waits_and_its_owner_is_told() {
+    let place = Place::new();
+    let (_coordinator, url) = start_farm(&place, "127.0.0.1:0");
+    let tiny = ["worker", "--threads", "1", "--memory", "0.0000001", "--coordinator", &url];
+    let _tiny = place.start("tiny.log", &tiny);
+    let submit = ["submit", "scene.rt", "-o", "out.png", "--coordinator", &url];
+    let small = ["--size", "64x48", "--samples", "2"];
+    let mut submit = place.start("submit.log", &[&submit[..], &small].concat());
+    poll(|| submit.log().contains("no worker can hold its scene of ").then_some(()));
+    let told = ask(&place, &url, &["jobs"]).1;
+    assert!(told.contains(" waits: no worker can hold its scene of "), "{told}");
+    let worker = ["worker", "--threads", "1", "--coordinator", &url];
+    let _worker = place.start("worker.log", &worker);
+    assert!(submit.wait().success(), "{}", submit.log());
+}
+
+#[test]
+fn a_tile_that_ends_three_workers_is_set_aside_the_others_finished_and_it_is_tried_again() {
+    let place = Place::new();
+    // Workers that compare its other tile would die of that one.
+    let no_audit = ["--audit", "0"];
+    let (mut coordinator, mut url) = start_farm_with(&place, "127.0.0.1:0", &no_audit);
+    let start = || place.start("worker.log", &["worker", "--threads", "1", "--coordinator", &url]);
+    let two_tiles = ["--size", "96x48", "--tile", "48", "--samples", "1024"];
+    let job = detach(&place, &url, &two_tiles);
     for _ in 0..3 {
-        let worker = start("worker.log");
-        poll(|| (entry(&place, &url, &fourth)["workers_now"] == 1).then_some(()));
+        let worker = start();
+        let is_in_work = |entry: Value| entry["workers_now"] == 1 && entry["tiles_done"] == 1;
+        poll(|| is_in_work(entry(&place, &url, &job)).then_some(()));
         worker.signal(Signal::KILL);
-        poll(|| (entry(&place, &url, &fourth)["workers_now"] == 0).then_some(()));
+        poll(|| (entry(&place, &url, &job)["workers_now"] == 0).then_some(()));
     }
-    let (code, _, log) = ask(&place, &url, &["watch", &fourth]);
+    let (code, _, log) = ask(&place, &url, &["watch", &job]);
     assert_eq!(code, Some(1));
-    assert!(log.contains("the job failed: 0 of 1 tiles are right; set aside"), "{log}");
+    assert!(log.contains("the job failed: 1 of 2 tiles are right; set aside"), "{log}");
     coordinator.signal(Signal::TERM);
     assert!(coordinator.wait().success());
-    (coordinator, url) = start_farm(&place, url.strip_prefix("http://").unwrap());
-    assert_eq!(entry(&place, &url, &fourth)["state"], "failed");
-    json(&place, &url, &["retry", &fourth]);
+    (coordinator, url) = start_farm_with(&place, url.strip_prefix("http://").unwrap(), &no_audit);
+    assert_eq!(entry(&place, &url, &job)["state"], "failed");
+    json(&place, &url, &["retry", &job]);
     let _worker = place.start("worker.log", &["worker", "--threads", "1", "--coordinator", &url]);
-    assert_eq!(json(&place, &url, &["watch", &fourth])["state"], "finished");
-    json(&place, &url, &["image", &fourth, "-o", "out.png"]);
-    let here = place.render("here.png", &[&one_tile[..], &["--workers", "0"]].concat());
+    assert_eq!(json(&place, &url, &["watch", &job])["state"], "finished");
+    json(&place, &url, &["image", &job, "-o", "out.png"]);
+    let here = place.render("here.png", &[&two_tiles[..], &["--workers", "0"]].concat());
     assert!(fs::read(place.path("out.png")).unwrap() == here);
     coordinator.signal(Signal::TERM);
     coordinator.wait();

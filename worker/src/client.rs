@@ -36,6 +36,7 @@ pub(crate) fn introduction(config: &Config, nonce: u64) -> wire::JoinRequest {
         process: std::process::id(),
         build: config.build.clone(),
         reference: config.reference.map(|hash| hash.to_vec().into()).unwrap_or_default(),
+        memory: config.memory.unwrap_or(0),
     }
 }
 

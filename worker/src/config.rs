@@ -21,6 +21,9 @@ pub struct Config {
     /// What [`crate::reference()`] makes of the instruction set; none where the coordinator does not
     /// ask for it.
     pub reference: Option<[u8; 32]>,
-    /// How long it goes on without a coordinator, from the first failure on.
+    /// Bytes that prepared scenes may have here together, those of tiles in work and those that are
+    /// kept; `None`: any scene is taken, and none kept that is not needed.
+    pub memory: Option<u64>,
+    /// How long it goes on without a coordinator, from the first call on that has no answer.
     pub patience: Duration,
 }

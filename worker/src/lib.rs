@@ -10,6 +10,7 @@ mod config;
 mod error;
 mod job;
 mod map;
+mod memory;
 mod outbox;
 mod outside;
 mod parent;
@@ -22,6 +23,7 @@ mod worker;
 
 pub use config::Config;
 pub use error::WorkerError;
+pub use memory::memory_for_scenes;
 pub use parent::{ParentError, die_with_parent};
 pub use reference::reference;
 pub use run::run;

@@ -203,13 +203,15 @@ impl<O: Outside> Shell<O> {
     }
 
     fn fetch(&mut self, task: TaskId, job: Arc<Job>, lease: LeaseName, silence: Duration) {
-        let client = self.client.clone().expect("a worker connects before it fetches");
         let (outside, pulse) = (Arc::clone(&self.outside), Arc::clone(&self.pulse));
-        let is_local = matches!(self.config.coordinator, Address::Unix(_));
+        let address = self.config.coordinator.clone();
         self.start(task, async move {
             let hash = job.scene;
             let beat = move || pulse.beat((lease, None));
-            let loaded = match scene::bring(&job, is_local, silence, client, &beat).await {
+            // A connection of its own: what comes over it takes no share from calls.
+            let connect = async || outside.connect(&address).await.map(client::over);
+            let is_local = matches!(address, Address::Unix(_));
+            let loaded = match scene::bring(&job, is_local, silence, connect, &beat).await {
                 Ok(file) => outside.block(move || scene::open(&file, &job, &beat)).await,
                 Err(error) => Err(error),
             };

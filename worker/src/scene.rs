@@ -60,12 +60,15 @@ pub(crate) async fn bring<C: Connection>(
     job: &Job,
     is_local: bool,
     silence: Duration,
-    client: FarmClient<C>,
+    connect: impl AsyncFnOnce() -> Result<FarmClient<C>, String>,
     beat: &(dyn Fn() + Sync),
 ) -> Result<File, SceneError> {
     match &job.scene_path {
         Some(path) if is_local => find(path),
-        _ => fetch(job, silence, client, beat).await,
+        _ => {
+            let client = connect().await.map_err(SceneError::Gone)?;
+            fetch(job, silence, client, beat).await
+        }
     }
 }
 
@@ -154,7 +157,7 @@ mod tests {
         };
         let nowhere = Address::Tcp("127.0.0.1:1".to_owned()).to_string();
         let client = FarmClient::new(Endpoint::from_shared(nowhere).unwrap().connect_lazy());
-        bring(&job, is_local, Duration::from_secs(20), client, &|| {}).await
+        bring(&job, is_local, Duration::from_secs(20), async || Ok(client), &|| {}).await
     }
 
     #[tokio::test]

@@ -9,7 +9,7 @@ use std::{
 
 use backon::{BackoffBuilder, ExponentialBuilder};
 use rtfarm_core::{prepared::SceneHash, tile::TileId};
-use rtfarm_proto::LeaseName;
+use rtfarm_proto::{LONGEST_WAIT, LeaseName};
 
 use crate::{
     call::{Call, CallError, CallErrorKind, Delivery},
@@ -55,6 +55,8 @@ type Backoff = <ExponentialBuilder as BackoffBuilder>::Backoff;
 #[derive(Debug)]
 struct Attempts {
     call: Call,
+    /// When it was last made.
+    asked_at: Instant,
     backoff: Backoff,
 }
 
@@ -76,8 +78,10 @@ enum Task {
 #[derive(Debug)]
 pub(crate) struct Tasks {
     patience: Duration,
-    /// When a call first failed for want of an answer, if none was answered since.
+    /// When the first call was made that failed for want of an answer, if none was answered since.
     silent_since: Option<Instant>,
+    /// When a call was last answered.
+    answered_at: Option<Instant>,
     seed: u64,
     begun: BTreeMap<TaskId, Task>,
     begun_count: u64,
@@ -94,12 +98,13 @@ pub(crate) struct GivenUp {
 
 impl Tasks {
     /// Nothing is under way. Calls that fail for want of an answer are repeated with growing
-    /// delays, which `seed` shuffles, until these would add up to more than `patience`, or the
-    /// first failure since the last answer to any call is so long ago.
+    /// delays, which `seed` shuffles, until these would add up to more than `patience`, or the first
+    /// of them that has had no answer since the last to any call was made so long ago.
     pub(crate) fn new(patience: Duration, seed: u64) -> Self {
         Self {
             patience,
             silent_since: None,
+            answered_at: None,
             seed,
             begun: BTreeMap::new(),
             begun_count: 0,
@@ -131,15 +136,22 @@ impl Tasks {
             .with_total_delay(Some(self.patience))
             .without_max_times()
             .build();
-        self.ask(Attempts { call, backoff }, now);
+        self.ask(Attempts { call, asked_at: now, backoff }, now);
     }
 
-    fn ask(&mut self, attempts: Attempts, now: Instant) {
-        let deadline = now + attempts.call.deadline();
-        let deadline = self.give_up_at().map_or(deadline, |end| end.min(deadline));
+    fn ask(&mut self, mut attempts: Attempts, now: Instant) {
+        attempts.asked_at = now;
+        let end = self.give_up_at().unwrap_or(now + self.patience);
+        let deadline = end.min(now + attempts.call.deadline());
         self.actions.push_back(Action::Call(TaskId(self.begun_count), attempts.call.clone()));
         let task = self.begin(Task::Asked { attempts, deadline });
         self.timers.insert((deadline, task));
+    }
+
+    /// The longest that a coordinator may be asked to think about an answer, so that one is not taken for
+    /// gone.
+    pub(crate) fn longest_wait(&self) -> Duration {
+        LONGEST_WAIT.min(self.patience / 2)
     }
 
     /// When nothing is waited for any more unless there is an answer.
@@ -167,9 +179,9 @@ impl Tasks {
     }
 
     /// Event: a call was answered. `None` when nobody waits for it.
-    pub(crate) fn on_answer(&mut self, task: TaskId) -> Option<Call> {
+    pub(crate) fn on_answer(&mut self, task: TaskId, now: Instant) -> Option<Call> {
         let attempts = self.take_asked(task)?;
-        self.silent_since = None;
+        (self.silent_since, self.answered_at) = (None, Some(now));
         Some(attempts.call)
     }
 
@@ -201,7 +213,8 @@ impl Tasks {
     ) -> Option<GivenUp> {
         let mut attempts = self.take_asked(task)?;
         if error.kind == CallErrorKind::NoAnswer {
-            self.silent_since.get_or_insert(now);
+            let since = self.answered_at.map_or(attempts.asked_at, |at| at.max(attempts.asked_at));
+            self.silent_since.get_or_insert(since);
         }
         let give_up_at = self.give_up_at();
         let may_repeat = match attempts.call {

@@ -10,7 +10,7 @@ use std::{
 };
 
 use rtfarm_core::{prepared::SceneHash, tile::TileId};
-use rtfarm_proto::{Address, DELIVERY_BYTES, FarmId, JobId, LONGEST_WAIT, LeaseName, Renewal};
+use rtfarm_proto::{Address, DELIVERY_BYTES, FarmId, JobId, LeaseName, Renewal};
 
 use crate::{
     call::{Answer, Call, CallError, CallErrorKind, Delivery, KeptTiles, Membership, Next, Run},
@@ -50,6 +50,7 @@ const CHUNK_DEADLINE: Duration = Duration::from_secs(30);
 pub(crate) struct Worker {
     coordinator: Address,
     threads: usize,
+    memory: Option<u64>,
     tasks: Tasks,
     /// The farm that it last joined, and pixels that it rendered for an earlier start of that farm.
     farm: Option<FarmId>,
@@ -77,12 +78,16 @@ enum Stage {
 struct Member {
     id: Membership,
     threads: usize,
+    /// Bytes that the scenes may have together; `None`: those of any scene that is needed.
+    memory: Option<u64>,
     /// The leases that this worker knows to have.
     leases: BTreeMap<LeaseName, Held>,
-    /// A run whose scene is being brought into memory.
+    /// A run whose scene waits for room, or is being brought into memory.
     fetching: Option<Run>,
-    /// Scenes in memory, the latest last.
-    scenes: Vec<SceneHash>,
+    /// The scene of that run is being brought.
+    is_fetching: bool,
+    /// Scenes in memory and their bytes, the last that was asked for last.
+    scenes: Vec<(SceneHash, u64)>,
     /// Tiles that wait for a thread, first come first served.
     waiting: VecDeque<Waiting>,
     /// The turn of a thread, in tiles: at least one.
@@ -102,6 +107,7 @@ struct Member {
 /// A lease that this worker has.
 #[derive(Debug)]
 struct Held {
+    scene: SceneHash,
     /// Tiles that are not on their way to the coordinator yet: at least one.
     tiles_left: usize,
     /// Steps that brought its scene.
@@ -128,6 +134,7 @@ impl Worker {
         Self {
             coordinator: config.coordinator.clone(),
             threads: config.threads,
+            memory: config.memory,
             tasks,
             farm: None,
             kept: Kept::new(),
@@ -148,7 +155,7 @@ impl Worker {
 
     /// Event: the coordinator has answered a call.
     pub(crate) fn on_answer(&mut self, task: TaskId, answer: Answer, now: Instant) {
-        let Some(call) = self.tasks.on_answer(task) else { return };
+        let Some(call) = self.tasks.on_answer(task, now) else { return };
         match (&mut self.stage, answer) {
             (Stage::Joining, Answer::Connected) => self.tasks.call(Call::Join, now),
             (Stage::Joining, Answer::Joined { member, farm, term }) => {
@@ -160,12 +167,13 @@ impl Worker {
                     self.kept.clear();
                 }
                 let kept = mem::take(&mut self.kept);
-                self.stage = Stage::Working(Member { kept, ..Member::new(member, self.threads) });
+                let member = Member::new(member, self.threads, self.memory);
+                self.stage = Stage::Working(Member { kept, ..member });
             }
             (Stage::Working(member), Answer::Leased(next)) => {
                 member.is_leasing = false;
                 match next {
-                    Next::Run(run) => member.on_run(run, &mut self.tasks),
+                    Next::Run(run) => member.on_run(run),
                     Next::Nothing => {}
                     Next::ShutDown => {
                         tracing::info!(worker = member.id.worker.0, "sent home");
@@ -217,6 +225,7 @@ impl Worker {
         match (&mut self.stage, error) {
             (Stage::Working(member), SceneError::Gone(reason)) => {
                 tracing::info!(worker = member.id.worker.0, reason, "dropped a lease");
+                member.is_fetching = false;
                 if let Some(run) = member.fetching.take() {
                     member.leases.remove(&run.lease);
                 }
@@ -298,7 +307,7 @@ impl Worker {
         tracing::warn!(reason, "joining again");
         let unheard = self.tasks.stop_all().into_iter().chain([unheard]);
         if let Stage::Working(member) = mem::replace(&mut self.stage, Stage::Joining) {
-            for scene in member.scenes {
+            for (scene, _) in member.scenes {
                 self.tasks.push(Action::ForgetScene(scene));
             }
             let delivered = unheard.filter_map(|call| match call {
@@ -354,12 +363,14 @@ impl Worker {
 }
 
 impl Member {
-    fn new(id: Membership, threads: usize) -> Self {
+    fn new(id: Membership, threads: usize, memory: Option<u64>) -> Self {
         Self {
             id,
             threads,
+            memory,
             leases: BTreeMap::new(),
             fetching: None,
+            is_fetching: false,
             scenes: Vec::new(),
             waiting: VecDeque::new(),
             turn: 1,
@@ -372,12 +383,12 @@ impl Member {
         }
     }
 
-    fn on_run(&mut self, mut run: Run, tasks: &mut Tasks) {
+    fn on_run(&mut self, mut run: Run) {
         if run.tiles.is_empty() {
             return;
         }
         let (tiles_left, begun) = (run.tiles.len(), BTreeMap::new());
-        let held = Held { tiles_left, work: 0, begun, has_news: false };
+        let held = Held { scene: run.job.scene, tiles_left, work: 0, begun, has_news: false };
         let lease = run.lease;
         self.leases.insert(lease, held);
         run.tiles.retain(|&tile| {
@@ -389,17 +400,19 @@ impl Member {
         if run.tiles.is_empty() {
             return;
         }
-        if self.scenes.contains(&run.job.scene) {
-            self.queue(run);
-        } else {
-            tasks.fetch(Arc::clone(&run.job), run.lease, CHUNK_DEADLINE);
-            self.fetching = Some(run);
+        match self.scenes.iter().position(|(scene, _)| *scene == run.job.scene) {
+            Some(place) => {
+                self.scenes[place..].rotate_left(1);
+                self.queue(run);
+            }
+            None => self.fetching = Some(run),
         }
     }
 
     fn on_fetched(&mut self) {
+        self.is_fetching = false;
         if let Some(run) = self.fetching.take() {
-            self.scenes.push(run.job.scene);
+            self.scenes.push((run.job.scene, run.job.scene_byte_count));
             // The lease may have been lost meanwhile.
             if self.leases.contains_key(&run.lease) {
                 self.queue(run);
@@ -420,6 +433,10 @@ impl Member {
                 self.waiting.retain(|waiting| waiting.lease != name);
                 tasks.stop_renderings(name);
             }
+        }
+        let is_lost = |run: &mut Run| lost.contains(&run.lease);
+        if !self.is_fetching {
+            self.fetching.take_if(is_lost);
         }
     }
 
@@ -477,7 +494,7 @@ impl Member {
             self.rendering_count += 1;
             tasks.render(lease, tile, job);
         }
-        self.forget_scenes(tasks);
+        self.keep_scenes(tasks);
 
         let tiles_left: usize = self.leases.values().map(|held| held.tiles_left).sum();
         let is_short = tiles_left < TURNS_AHEAD * self.turn * self.threads;
@@ -489,7 +506,7 @@ impl Member {
                 job,
                 tiles: self.kept.keys().filter(|key| key.0 == job).map(|key| key.1).collect(),
             });
-            let wait = LONGEST_WAIT;
+            let wait = tasks.longest_wait();
             tasks.call(Call::Lease { member: self.id, most_tiles, wait, kept }, now);
         }
         let has_news = self.leases.values().any(|held| held.has_news);
@@ -525,15 +542,34 @@ impl Member {
         }
     }
 
-    /// Keeps the latest scene and those that waiting tiles need.
-    fn forget_scenes(&mut self, tasks: &mut Tasks) {
-        let Some((&latest, [_, ..])) = self.scenes.split_last() else { return };
-        let waiting = &self.waiting;
-        let is_needed = |scene: &SceneHash| {
-            *scene == latest || waiting.iter().any(|waiting| waiting.job.scene == *scene)
+    /// Forgets scenes that no lease needs, those first that were asked for longest ago, until the others
+    /// and the one that is wanted have room; then has that one brought.
+    fn keep_scenes(&mut self, tasks: &mut Tasks) {
+        let wanted = self.fetching.as_ref().map_or(0, |run| run.job.scene_byte_count);
+        let mut bytes = self.scenes.iter().map(|(_, bytes)| bytes).sum::<u64>() + wanted;
+        let latest = self.scenes.last().map(|&(scene, _)| scene);
+        let leases = &self.leases;
+        let is_needed = |scene| leases.values().any(|held| held.scene == scene);
+        let memory = self.memory;
+        let is_kept = |scene, bytes: u64| match memory {
+            Some(memory) => bytes <= memory,
+            None => latest == Some(scene),
         };
-        for forgotten in self.scenes.extract_if(.., |scene| !is_needed(scene)) {
-            tasks.push(Action::ForgetScene(forgotten));
+        for (scene, its_bytes) in self.scenes.extract_if(.., |(scene, its_bytes)| {
+            let goes = !is_kept(*scene, bytes) && !is_needed(*scene);
+            bytes -= if goes { *its_bytes } else { 0 };
+            goes
+        }) {
+            tracing::debug!(%scene, bytes = its_bytes, "forgot a scene");
+            tasks.push(Action::ForgetScene(scene));
+        }
+        let has_room = memory.is_none_or(|memory| bytes <= memory) || self.scenes.is_empty();
+        if let Some(run) = &self.fetching
+            && !self.is_fetching
+            && has_room
+        {
+            self.is_fetching = true;
+            tasks.fetch(Arc::clone(&run.job), run.lease, CHUNK_DEADLINE);
         }
     }
 }

@@ -1,14 +1,17 @@
 //! What people do with a farm: look at it, change the order of its jobs, stop some, try again what
 //! failed, send workers home. And how long it keeps what has ended.
 
-use std::time::{Duration, Instant};
+use std::{
+    collections::BTreeMap,
+    time::{Duration, Instant},
+};
 
 use rtfarm_job::{Outcome, Progress};
 use rtfarm_proto::{JobId, WorkerId};
 
 use super::{Action, Earlier, Farm, JobState, Notice};
 use crate::{
-    members::{MemberEntry, NoMember, Standing},
+    members::{Mark, MemberEntry, NoMember, Standing},
     tiles::Tiles,
 };
 
@@ -39,6 +42,8 @@ pub(crate) struct Terms {
     pub(crate) is_paused: bool,
     /// The most workers that have tiles of it at the same time.
     pub(crate) most_workers: Option<u32>,
+    /// Bytes of its scene, as a worker has them.
+    pub(crate) scene_byte_count: u64,
     /// What is kept for it.
     pub(crate) byte_count: u64,
     /// Another build began it, and this one cannot go on with it.
@@ -209,6 +214,8 @@ impl Farm {
                 job.progress.tally = earlier.tally;
                 job.progress.worker_count = earlier.worker_count;
                 job.progress.tiles_done = tiles.done_count();
+                job.earlier = earlier;
+                job.tallies.clear();
                 tiles
             }
             (None, None) => return refused(Refused::TilesUnknown),
@@ -225,6 +232,7 @@ impl Farm {
         self.leases.on_submit(id, tiles, job.terms.priority);
         // Its last tile may have been written while it failed.
         self.finish(id, now);
+        self.look_for_obstacles(&mut actions);
         self.serve(now, &mut actions);
         (Ok(()), actions)
     }
@@ -240,8 +248,39 @@ impl Farm {
             return (Err(stranger), Vec::new());
         }
         let mut actions = vec![Action::Log(Notice::Stationed(worker, standing))];
+        actions.push(self.keep_marks());
+        self.look_for_obstacles(&mut actions);
         self.serve(now, &mut actions);
         (Ok(()), actions)
+    }
+
+    /// Remembers what an earlier start of the farm knew of processes.
+    pub(crate) fn remember(&mut self, marks: BTreeMap<u64, Mark>) {
+        self.members.remember(marks);
+    }
+
+    pub(super) fn keep_marks(&self) -> Action {
+        Action::KeepMarks(self.members.marks().clone())
+    }
+
+    /// Says of each job under way whether there are workers, but none that can hold its scene.
+    pub(super) fn look_for_obstacles(&mut self, actions: &mut Vec<Action>) {
+        let Some(most) = self.members.most_memory() else { return };
+        for (id, _) in self.leases.jobs() {
+            let Some(job) = self.jobs.get_mut(&id) else { continue };
+            let bytes = job.terms.scene_byte_count;
+            let obstacle = (bytes > most).then(|| {
+                format!(
+                    "no worker can hold its scene of {bytes} bytes: the largest has room for {most}"
+                )
+            });
+            if job.progress.obstacle != obstacle {
+                job.progress.obstacle.clone_from(&obstacle);
+                job.progress.obstacle_count += 1;
+                actions.push(Action::Publish(id, job.progress.clone()));
+                actions.extend(obstacle.map(|reason| Action::Log(Notice::NoRoom(id, reason))));
+            }
+        }
     }
 
     /// Sends workers home that are to go, ask for tiles and have none.
@@ -251,7 +290,9 @@ impl Farm {
         for worker in drained {
             if let Some(ask) = self.waiting.of(worker) {
                 self.waiting.remove(ask);
+                self.members.on_drained(worker);
                 self.send_home(worker, ask, actions);
+                actions.push(self.keep_marks());
                 let reason = "it was drained".to_owned();
                 actions.push(Action::Log(Notice::Gone(worker, reason)));
             }

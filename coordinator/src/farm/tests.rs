@@ -372,9 +372,10 @@ fn a_third_worker_says_who_of_two_lies_and_the_liars_tiles_are_rendered_again() 
         if liar_is_first {
             let both = [run.tiles[0].number(), other.tiles[0].number()];
             assert_eq!(found(&actions), [lies, format!("{both:?} of {liar}")]);
-            assert_eq!(shown(&actions).tiles_done, 0);
+            assert_eq!((shown(&actions).tiles_done, shown(&actions).tally.rays), (0, 0));
             assert!(matches!(actions.last(), Some(Action::Store(stored, ..)) if *stored == id));
-            assert_eq!(shown(&world.store(&last)).tiles_done, 1);
+            let now = shown(&world.store(&last));
+            assert_eq!((now.tiles_done, now.tally.rays), (1, 10), "what came last alone counts");
             assert_eq!(world.lease(second).tiles, run.tiles, "it is the first of the third");
             assert_eq!(world.lease(second).tiles, other.tiles, "it is free again");
         } else {
@@ -436,6 +437,7 @@ fn a_tile_of_which_nobody_knows_who_is_right_fails_its_job_at_the_end() {
             "1 of 2 tiles are right; rendered differently, and nobody knows who is right: {tile}"
         );
         assert_eq!(shown(&actions).outcome, Some(Outcome::Failed(reason)));
+        assert_eq!((shown(&actions).tiles_done, shown(&actions).tally.rays), (1, 10));
     }
 }
 
@@ -821,9 +823,54 @@ fn a_job_that_failed_under_an_earlier_start_is_tried_again_when_its_tiles_are_kn
     assert_eq!(retry(&mut world, 1, None), Err(Refused::TilesUnknown));
     let mut tiles = Tiles::new(grid);
     tiles.set_done(grid.tile(0).unwrap(), [7; 32]);
-    assert_eq!(retry(&mut world, 1, Some((tiles, Earlier::default()))), Ok(()));
+    let tally = Tally { rays: 5, ..Tally::default() };
+    let earlier = Earlier { elapsed: SECOND * 7, tally, worker_count: 3 };
+    assert_eq!(retry(&mut world, 1, Some((tiles, earlier))), Ok(()));
     let worker = world.join();
-    assert_eq!(world.lease(worker).tiles, [grid.tile(1).unwrap()]);
+    let run = world.lease(worker);
+    assert_eq!(run.tiles, [grid.tile(1).unwrap()]);
+    world.pass(SECOND);
+    let end = shown(&world.stitch(worker, &run));
+    assert_eq!(end.outcome, Some(Outcome::Finished(SECOND * 8)), "all of its time counts");
+    assert_eq!((end.tally.rays, end.worker_count), (15, 3));
+}
+
+#[test]
+fn a_worker_gets_no_scene_for_which_it_has_no_memory_and_who_waits_is_told() {
+    let mut world = World::new();
+    let process = |nonce, memory| Process {
+        nonce,
+        number: nonce as u32,
+        threads: 1,
+        memory: Some(memory),
+        ..Process::default()
+    };
+    let obstacle = |world: &World| world.farm.job_entries(world.now)[0].progress.obstacle.clone();
+    let job = world.submit_with(4, Terms { scene_byte_count: 100, ..Terms::default() });
+    assert_eq!(obstacle(&world), None, "somebody may join");
+    let (small, actions) = world.farm.on_join(process(1, 99), world.now);
+    let small = small.unwrap();
+    let reason = "no worker can hold its scene of 100 bytes: the largest has room for 99";
+    assert_eq!(obstacle(&world).as_deref(), Some(reason));
+    assert_eq!(shown(&actions).obstacle.as_deref(), Some(reason));
+    let is_told =
+        |action: &Action| matches!(action, Action::Log(Notice::NoRoom(of, _)) if *of == job);
+    assert!(actions.iter().any(is_told));
+    let (waits, actions) = world.ask(small, SECOND * 99);
+    assert!(answers(&actions).is_empty());
+
+    let (large, actions) = world.farm.on_join(process(2, 100), world.now);
+    assert_eq!(shown(&actions).obstacle, None);
+    let run = world.lease(large.unwrap());
+    assert_eq!(run.lease.job, job);
+    let later = world.submit_with(4, Terms { scene_byte_count: 99, ..Terms::default() });
+    world.pass(SECOND * 20);
+    let (asked, actions) = world.ask(small, SECOND);
+    let [(id, Ok(Next::Render(run)))] = &answers(&actions)[..] else { panic!("{actions:?}") };
+    assert_eq!((*id, run.lease.job), (asked, later), "neither free nor overdue tiles of the first");
+    assert_ne!(waits, asked);
+    world.farm.on_leave(large.unwrap(), "", world.now);
+    assert_eq!(obstacle(&world).as_deref(), Some(reason));
 }
 
 #[test]
@@ -856,6 +903,8 @@ fn a_drained_worker_brings_what_it_has_and_goes_home_and_a_disabled_one_gets_not
     assert_eq!((entry.worker, entry.standing), (disabled, Standing::Disabled));
     let actions = station(&mut world, disabled, Standing::Active).unwrap();
     assert!(matches!(answers(&actions)[..], [(id, Ok(Next::Render(_)))] if id == asked));
+    let kept = |action: &Action| matches!(action, Action::KeepMarks(marks) if marks.is_empty());
+    assert!(actions.iter().any(kept), "nobody is drained or disabled any more");
 }
 
 #[test]
@@ -982,4 +1031,17 @@ fn a_farm_that_keeps_its_jobs_goes_on_with_them() {
     let actions = world.farm.on_shut_down(world.now);
     assert!(!actions.iter().any(|action| matches!(action, Action::Publish(..))), "{actions:?}");
     assert!(world.farm.tile(job, 0).is_some(), "it goes on later");
+}
+
+#[test]
+fn a_worker_on_trial_gets_nothing_besides_though_it_kept_pixels() {
+    let mut world = World::new();
+    let (job, _) = world.submit(3);
+    let dead = world.join();
+    let suspect = world.lease(dead).tiles[0];
+    world.farm.on_process_exit(world.last_number as u32 - 1, "killed by signal 11", world.now);
+    let worker = world.join();
+    assert_eq!(world.lease(worker).tiles, [suspect]);
+    assert_eq!(world.farm.on_offer(worker, job, &[0, 1, 2], world.now), None);
+    world.farm.check();
 }

@@ -43,6 +43,7 @@ impl Farm {
     /// Keeps a liar out, and takes back what it rendered, unless another worker confirmed it.
     fn quarantine(&mut self, liar: WorkerId, now: Instant, actions: &mut Vec<Action>) {
         self.members.on_lie(liar);
+        actions.push(self.keep_marks());
         self.lose_worker(liar, false, "it brought wrong pixels", now, actions);
         self.audit.on_quarantine(liar);
         let jobs: Vec<JobId> = self.leases.jobs().map(|(job, _)| job).collect();
@@ -58,6 +59,7 @@ impl Farm {
             self.audit.end(id, *tile);
             job.unsettled.remove(tile);
         }
+        job.forget_tallies(&tiles.iter().copied().collect());
         job.progress.tiles_done -= tiles.len() as u32;
         job.progress.taken_back += tiles.len() as u32;
         self.finishing.remove(&id);

@@ -6,7 +6,7 @@ use rtfarm_core::{
     render::{Quality, Settings, Tally},
     tile::{Size, TileGrid},
 };
-use rtfarm_proto::{FarmId, Incarnation, JobId, TileHasher, WorkerId, wire};
+use rtfarm_proto::{FarmId, Incarnation, JobId, LONGEST_WAIT, TileHasher, WorkerId, wire};
 
 use super::*;
 
@@ -97,6 +97,15 @@ impl Bench {
     }
 
     fn with_patience(threads: usize, patience: Duration) -> Self {
+        Self::with(threads, patience, None)
+    }
+
+    /// One thread, with so many bytes for scenes.
+    fn with_memory(memory: Option<u64>) -> Self {
+        Self::with(1, PATIENCE, memory)
+    }
+
+    fn with(threads: usize, patience: Duration, memory: Option<u64>) -> Self {
         let config = Config {
             coordinator: Address::Tcp("host:1".to_owned()),
             threads,
@@ -104,6 +113,7 @@ impl Bench {
             version: "1".to_owned(),
             build: String::new(),
             reference: None,
+            memory,
             patience,
         };
         let now = start();
@@ -466,7 +476,7 @@ fn a_lease_lost_while_its_scene_is_fetched_is_not_rendered() {
 }
 
 #[test]
-fn a_scene_is_forgotten_when_another_came_and_no_tile_waits_for_it() {
+fn a_scene_is_forgotten_when_another_came_and_no_lease_needs_it() {
     let mut bench = Bench::rendering(1, 1);
     bench.answer(is_lease, run(2, 4, 0));
     while bench.renderings.len() > 1 {
@@ -476,7 +486,9 @@ fn a_scene_is_forgotten_when_another_came_and_no_tile_waits_for_it() {
     bench.answer(is_lease, run(3, 7, 1));
     assert_eq!(bench.scenes, [SceneHash([0; 32])]);
     bench.fetch();
-    assert_eq!(bench.scenes, [SceneHash([1; 32])], "the last tile of the first was begun");
+    assert_eq!(bench.scenes.len(), 2, "a tile of the first is in work");
+    bench.render();
+    assert_eq!(bench.scenes, [SceneHash([1; 32])], "the last tile of the first was rendered");
 }
 
 #[test]
@@ -497,6 +509,54 @@ fn a_scene_that_waiting_tiles_need_is_kept() {
         bench.render();
     }
     assert_eq!(bench.scenes, [SceneHash([1; 32])]);
+}
+
+#[test]
+fn scenes_are_kept_as_long_as_there_is_memory_and_the_least_recent_goes_first() {
+    // A scene of the tests has one byte.
+    let mut bench = Bench::with_memory(Some(2));
+    bench.answer(|call| matches!(call, Call::Connect), Answer::Connected);
+    bench.join(1);
+    let mut number = 0;
+    let mut render = |bench: &mut Bench, scene| {
+        number += 1;
+        bench.answer(is_lease, run(number, 1, scene));
+        let is_new = !bench.fetches.is_empty();
+        if is_new {
+            bench.fetch();
+        }
+        bench.render();
+        bench.answer(is_deliver, Answer::Delivered);
+        is_new
+    };
+    assert!(render(&mut bench, 0) && render(&mut bench, 1));
+    assert!(!render(&mut bench, 0), "it is there still");
+    assert!(render(&mut bench, 2));
+    assert_eq!(bench.scenes, [SceneHash([0; 32]), SceneHash([2; 32])]);
+    assert!(render(&mut bench, 1));
+    assert_eq!(bench.scenes, [SceneHash([2; 32]), SceneHash([1; 32])]);
+}
+
+#[test]
+fn a_scene_for_which_there_is_no_room_waits_for_the_tiles_of_another() {
+    let mut bench = Bench::with_memory(Some(1));
+    bench.answer(|call| matches!(call, Call::Connect), Answer::Connected);
+    bench.join(1);
+    bench.answer(is_lease, run(1, 1, 0));
+    bench.fetch();
+    bench.answer(is_lease, run(2, 1, 1));
+    assert!(bench.fetches.is_empty(), "a tile of the first scene is in work");
+    assert!(!bench.has(is_lease));
+    bench.render();
+    assert!(bench.scenes.is_empty() && bench.fetches.len() == 1);
+    bench.fetch();
+    assert_eq!(bench.render().0, lease(2));
+
+    bench.answer(is_lease, run(3, 1, 1));
+    bench.answer(is_lease, run(4, 1, 2));
+    bench.step(3, 0);
+    bench.answer(is_renew, Answer::Renewed { lost: vec![lease(4)] });
+    assert!(bench.has(is_lease), "who has lost what it waits for asks for something else");
 }
 
 #[test]
@@ -630,13 +690,31 @@ fn a_silent_coordinator_is_asked_again_and_in_the_end_given_up() {
     while bench.has(is_lease) || !bench.has(|_| true) {
         bench.sleep();
     }
-    let waited = bench.now - (begun + deadline);
+    let waited = bench.now - begun;
     assert!(waited <= PATIENCE && waited + Duration::from_secs(4) > PATIENCE, "{waited:?}");
     let before = bench.now;
     bench.sleep();
     assert_eq!(bench.now - before, Duration::from_secs(1), "nobody hears that it leaves");
     let reason = "the coordinator is gone: it did not answer in time".to_owned();
     assert_eq!(bench.exit, Some(Err(reason)));
+}
+
+#[test]
+fn a_silent_coordinator_is_given_up_within_patience_though_an_answer_might_take_longer() {
+    let patience = Duration::from_secs(3);
+    let mut bench = Bench::with_patience(1, patience);
+    bench.answer(|call| matches!(call, Call::Connect), Answer::Connected);
+    bench.join(1);
+    let Call::Lease { wait, .. } = bench.asked(is_lease) else { panic!("tiles are asked for") };
+    assert_eq!(wait, patience / 2, "one that has nothing answers in time");
+    bench.now += patience / 2;
+    bench.answer(is_lease, Answer::Leased(Next::Nothing));
+    let begun = bench.now;
+    while bench.exit.is_none() {
+        bench.sleep();
+    }
+    let farewell = Duration::from_secs(1);
+    assert_eq!(bench.now - begun, patience + farewell);
 }
 
 #[test]
@@ -648,6 +726,7 @@ fn workers_do_not_all_ask_again_at_once() {
         version: "1".to_owned(),
         build: String::new(),
         reference: None,
+        memory: None,
         patience: PATIENCE,
     };
     let now = start();
