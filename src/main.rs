@@ -11,7 +11,6 @@ mod local;
 mod log_queue;
 mod output;
 mod pilot;
-mod plain;
 mod private_folder;
 mod queue;
 mod render;
@@ -19,7 +18,6 @@ mod report;
 mod resume;
 mod scene_files;
 mod source;
-mod submission;
 mod submit;
 mod worker;
 

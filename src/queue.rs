@@ -7,6 +7,7 @@ use std::{
 };
 
 use anyhow::{Context, anyhow};
+use rtfarm_client::plain;
 use rtfarm_core::{render::Tally, tile::Size};
 use rtfarm_job::Progress;
 use rtfarm_proto::{
@@ -22,7 +23,6 @@ use crate::{
     args::{FarmArgs, JobArgs},
     console::Console,
     failure::Failure,
-    plain::plain,
     submit::reach,
 };
 

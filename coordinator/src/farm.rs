@@ -461,7 +461,8 @@ impl Farm {
         now: Instant,
     ) -> Option<Run> {
         self.members.on_sign_of_life(worker, now).ok()?;
-        if self.phase != Phase::Open || !self.may_render(worker, job) {
+        let may = self.may_render(worker, job) && !self.leases.is_on_trial(worker);
+        if self.phase != Phase::Open || !may {
             return None;
         }
         let grid = self.leases.tiles(job)?.grid();
