@@ -7,6 +7,7 @@ use std::{
 };
 
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+use rtfarm_client::plain;
 use rtfarm_core::language::Style;
 use rtfarm_job::Progress;
 use serde_json::json;
@@ -21,7 +22,6 @@ use tracing_subscriber::{
 use crate::{
     args::{Args, Command, LogFormat},
     log_queue::LogQueue,
-    plain::plain,
 };
 
 /// Standard error. Clones are the same one.

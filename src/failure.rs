@@ -2,7 +2,10 @@
 
 use std::{fmt, process::ExitCode};
 
-use crate::{console::Console, plain::plain};
+use anyhow::anyhow;
+use rtfarm_client::{NoPicture, plain};
+
+use crate::console::Console;
 
 /// What a process ends with that somebody stopped.
 pub(crate) const INTERRUPTED: u8 = 130;
@@ -37,6 +40,16 @@ impl fmt::Display for Failure {
 }
 
 impl Failure {
+    /// Why a farm gave no picture.
+    pub(crate) fn of_client(reason: NoPicture) -> Self {
+        match reason {
+            NoPicture::Refused(reason) => Self::Input(anyhow!(reason)),
+            NoPicture::Told => Self::Told,
+            NoPicture::Failed(reason) => Self::Other(anyhow!(reason)),
+            NoPicture::Interrupted => Self::Interrupted,
+        }
+    }
+
     /// What the process ends with.
     pub(crate) fn exit_code(&self) -> u8 {
         match self {

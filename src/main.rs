@@ -14,7 +14,6 @@ mod log_queue;
 mod manual;
 mod output;
 mod pilot;
-mod plain;
 mod private_folder;
 mod queue;
 mod render;
@@ -22,7 +21,6 @@ mod report;
 mod resume;
 mod scene_files;
 mod source;
-mod submission;
 mod submit;
 mod worker;
 

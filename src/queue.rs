@@ -8,6 +8,7 @@ use std::{
 };
 
 use anyhow::{Context, anyhow};
+use rtfarm_client::{FIRST_PAUSE, LONGEST_PAUSE, is_lost, plain};
 use rtfarm_core::{render::Tally, tile::Size};
 use rtfarm_job::Progress;
 use rtfarm_proto::{
@@ -23,9 +24,7 @@ use crate::{
     args::{FarmArgs, WatchArgs},
     console::Console,
     failure::Failure,
-    plain::plain,
-    submission::{FIRST_PAUSE, LONGEST_PAUSE},
-    submit::{is_lost, reach},
+    submit::reach,
 };
 
 /// The longest that a coordinator may take to answer.

@@ -1,32 +1,23 @@
-//! `rtfarm submit`: a picture from a farm. It does what [`Submission`] decides, and tells it what
-//! came of it.
+//! `rtfarm submit`: a picture from a farm. `rtfarm_client` follows the job; here are its user, its
+//! files and its connection.
 
 use std::{
     collections::BTreeMap,
-    error::Error,
-    future::pending,
     io::{self, Write},
-    ops::ControlFlow,
-    panic::resume_unwind,
     sync::Arc,
 };
 
-use anyhow::Context;
-use rtfarm_core::{render::Tally, tile::Size};
+use rtfarm_client::{Ended, Finished, JobState, Order, Outside, Trouble};
 use rtfarm_job::Progress;
 use rtfarm_proto::{
-    Address, Bytes, CHUNK_BYTES, JobId, MESSAGE_BYTES, PROTOCOL, WireError,
-    wire::{self, event, jobs_client::JobsClient, submit_request::Part, submit_response},
+    Address, CHUNK_BYTES, JobId, MESSAGE_BYTES, PROTOCOL,
+    wire::{self, jobs_client::JobsClient, submit_request::Part},
 };
 use serde_json::json;
-use tokio::{
-    sync::mpsc,
-    task::{JoinHandle, spawn_blocking},
-    time::Instant,
-};
-use tokio_stream::wrappers::ReceiverStream;
+use tokio::{sync::mpsc, task::spawn_blocking, time::Instant};
+use tokio_stream::{Stream, wrappers::ReceiverStream};
 use tokio_util::sync::CancellationToken;
-use tonic::{Code, Status, Streaming, transport::Channel};
+use tonic::transport::Channel;
 
 use crate::{
     VERSION,
@@ -34,14 +25,10 @@ use crate::{
     console::{Bar, Console},
     failure::Failure,
     output::Output,
-    plain::plain,
     queue,
     render::Summary,
     scene_files::SceneFiles,
     source::{SceneText, read_named_files},
-    submission::{
-        Action, Ended, Finished, JobEnd, JobState, Submission, SubmitOutcome, Submitted, Trouble,
-    },
 };
 
 pub(crate) async fn run(
@@ -52,29 +39,19 @@ pub(crate) async fn run(
     let started = Instant::now();
     let mut output = args.picture.output().map_err(Failure::Input)?;
     output.check()?;
-    let text = SceneText::read(&args.picture.scene, stop).await?;
-    let (scene, coordinator) = (args.picture.scene.name(), args.coordinator.clone());
-    let mut submission = Submission::new(scene, coordinator, args.patience, args.detach, now());
+    let text = Arc::new(SceneText::read(&args.picture.scene, stop).await?);
     let key = match &args.key {
         Some(key) => key.clone(),
         None => random_key()?,
     };
-    let mut shell = Shell {
-        args: &args,
-        output: &output,
-        console,
-        stop,
-        key,
-        text: Arc::new(text),
-        client: None,
-        farm: Bytes::new(),
-        reports: mpsc::channel(1).1,
-        running: None,
-        writing: None,
-        bar: None,
+    let order = Order {
+        scene: args.picture.scene.name(),
+        coordinator: args.coordinator.clone(),
+        patience: args.patience,
+        is_detached: args.detach,
     };
-    let ended = shell.follow(&mut submission).await;
-    shell.close().await;
+    let mut here = Here { args: &args, output: &output, console, stop, key, text, bar: None };
+    let ended = rtfarm_client::run(&mut here, order, stop).await.map_err(Failure::of_client);
 
     let (job, finished) = match ended? {
         Ended::Finished(job, finished) => (job, finished),
@@ -119,20 +96,8 @@ fn login_name() -> String {
         .unwrap_or_else(|| rustix::process::getuid().as_raw().to_string())
 }
 
-fn now() -> std::time::Instant {
-    Instant::now().into_std()
-}
-
-/// Waits for a moment; for ever when there is none.
-async fn sleep_until(moment: Option<std::time::Instant>) {
-    match moment {
-        Some(moment) => tokio::time::sleep_until(Instant::from_std(moment)).await,
-        None => pending().await,
-    }
-}
-
-/// What is being done, and what it needs.
-struct Shell<'a> {
+/// The user, the files and the network of this machine.
+struct Here<'a> {
     args: &'a SubmitArgs,
     output: &'a Output,
     console: &'a Console,
@@ -140,186 +105,46 @@ struct Shell<'a> {
     /// Tells the order from every other, though it may be sent again.
     key: String,
     text: Arc<SceneText>,
-    client: Option<JobsClient<Channel>>,
-    /// The id of the farm that took the order.
-    farm: Bytes,
-    /// What the running task tells.
-    reports: mpsc::Receiver<Report>,
-    running: Option<JoinHandle<()>>,
-    /// The thread that writes the picture.
-    writing: Option<JoinHandle<()>>,
     bar: Option<Bar>,
 }
 
-/// What a task tells.
-enum Report {
-    Connected(JobsClient<Channel>),
-    Submitted(Submitted, Bytes),
-    Watching,
-    JobState(JobState),
-    ChunkAwaited,
-    Chunk,
-    Fetched,
-    Cancelled,
-    Trouble(Trouble),
-}
+impl Outside for Here<'_> {
+    type Connection = Channel;
 
-impl Shell<'_> {
-    /// Does what is decided, to the end.
-    async fn follow(&mut self, submission: &mut Submission) -> Result<Ended, Failure> {
-        let stop = self.stop;
-        let mut is_stopped = false;
-        loop {
-            while let Some(action) = submission.next_action() {
-                if let ControlFlow::Break(end) = self.execute(action) {
-                    return end;
-                }
-            }
-            let wake_at = submission.wake_at();
-            tokio::select! {
-                // An interruption goes first: others may be its consequences.
-                biased;
-                () = stop.cancelled(), if !is_stopped => {
-                    is_stopped = true;
-                    submission.on_stop(now());
-                }
-                report = self.next_report() => self.pass_on(report, submission),
-                () = sleep_until(wake_at) => submission.on_tick(now()),
-            }
+    fn connect(
+        &self,
+    ) -> impl Future<Output = Result<JobsClient<Channel>, Trouble>> + Send + 'static {
+        let address = self.args.coordinator.clone();
+        async move {
+            let reached = reach(&address).await.map_err(anyhow::Error::from);
+            reached.map_err(|error| Trouble::Connect(address, format!("{error:#}")))
         }
     }
 
-    /// Waits until the picture's file is whole or removed.
-    async fn close(&mut self) {
-        self.end_task();
-        if let Some(writing) = self.writing.take() {
-            let _ = writing.await;
+    fn order(
+        &self,
+    ) -> impl Future<
+        Output = Result<impl Stream<Item = wire::SubmitRequest> + Send + 'static, Trouble>,
+    > + Send
+    + 'static {
+        let (order, text, scene) =
+            (self.wire_order(), Arc::clone(&self.text), &self.args.picture.scene);
+        let (scene_files, name) = (SceneFiles::new(scene), scene.name());
+        async move {
+            let files = spawn_blocking(move || {
+                let files = read_named_files(&text, &scene_files);
+                text.ensure_unchanged().map(|()| (text, files))
+            });
+            let (text, files) = files
+                .await
+                .expect("reading never panics")
+                .map_err(|error| Trouble::File(format!("cannot read the scene {name}: {error}")))?;
+            Ok(parts(order, text, files))
         }
     }
 
-    fn execute(&mut self, action: Action) -> ControlFlow<Result<Ended, Failure>> {
-        match action {
-            Action::Connect => {
-                let address = self.args.coordinator.clone();
-                self.start(|reports| connect(address, reports));
-            }
-            Action::Submit => {
-                let order = self.order();
-                let (client, text) = (self.client(), Arc::clone(&self.text));
-                let scene = &self.args.picture.scene;
-                let (scene_files, name) = (SceneFiles::new(scene), scene.name());
-                self.start(|reports| async move {
-                    let files = spawn_blocking(move || {
-                        let files = read_named_files(&text, &scene_files);
-                        text.ensure_unchanged().map(|()| (text, files))
-                    });
-                    let report = match files.await.expect("reading never panics") {
-                        Ok((text, files)) => submit(client, order, text, files).await,
-                        Err(error) => {
-                            let reason = format!("cannot read the scene {name}: {error}");
-                            Report::Trouble(Trouble::File(reason))
-                        }
-                    };
-                    let _ = reports.send(report).await;
-                });
-            }
-            Action::TellReport(report) => self.console.tell_report(&report),
-            Action::Watch(job) => {
-                let request = wire::WatchRequest { job: job.0, farm: self.farm.clone() };
-                let client = self.client();
-                self.start(|reports| watch(client, request, reports));
-            }
-            Action::Show(state) => self.show(&state),
-            Action::WarnOfObstacle(reason) => tracing::warn!(reason, "the job waits"),
-            Action::WarnOfDifferingTiles(tiles) => {
-                self.bar = None;
-                tracing::warn!(
-                    tiles,
-                    "two workers rendered the same tile differently; one of them is broken"
-                );
-            }
-            Action::Fetch(job) => {
-                let (send, chunks) = mpsc::channel(2);
-                let request =
-                    wire::ImageRequest { job: job.0, farm: self.farm.clone(), partial: false };
-                let client = self.client();
-                let reports = self.start(|reports| fetch(client, request, send, reports));
-                self.writing = Some(write(self.output.clone(), self.stop.clone(), chunks, reports));
-            }
-            Action::Cancel(job) => {
-                let mut client = self.client();
-                let request = wire::CancelRequest { job: job.0, farm: self.farm.clone() };
-                self.start(|reports| async move {
-                    let cancelled = client.cancel(request).await;
-                    let report =
-                        cancelled.map_or_else(|status| failed(&status), |_| Report::Cancelled);
-                    let _ = reports.send(report).await;
-                });
-            }
-            Action::End(end) => {
-                self.bar = None;
-                return ControlFlow::Break(end);
-            }
-        }
-        ControlFlow::Continue(())
-    }
-
-    /// Ends the running task and starts another. Answers with where it tells its reports.
-    fn start<F>(&mut self, task: impl FnOnce(mpsc::Sender<Report>) -> F) -> mpsc::Sender<Report>
-    where
-        F: Future<Output = ()> + Send + 'static,
-    {
-        self.end_task();
-        self.bar = None;
-        let (send, receive) = mpsc::channel(1);
-        self.reports = receive;
-        self.running = Some(tokio::spawn(task(send.clone())));
-        send
-    }
-
-    fn end_task(&mut self) {
-        self.reports.close();
-        if let Some(running) = self.running.take() {
-            running.abort();
-        }
-    }
-
-    async fn next_report(&mut self) -> Report {
-        if let Some(report) = self.reports.recv().await {
-            return report;
-        }
-        // A task that has nothing more to tell has told what ends it, or has panicked.
-        if let Some(running) = self.running.take()
-            && let Err(error) = running.await
-            && error.is_panic()
-        {
-            resume_unwind(error.into_panic());
-        }
-        pending().await
-    }
-
-    fn pass_on(&mut self, report: Report, submission: &mut Submission) {
-        match report {
-            Report::Connected(client) => {
-                self.client = Some(client);
-                submission.on_connected(now());
-            }
-            Report::Submitted(submitted, farm) => {
-                self.farm = farm;
-                submission.on_submitted(submitted, now());
-            }
-            Report::Watching => submission.on_watching(),
-            Report::JobState(state) => submission.on_job_state(state, now()),
-            Report::ChunkAwaited => submission.on_chunk_awaited(now()),
-            Report::Chunk => submission.on_chunk(),
-            Report::Fetched => submission.on_fetched(now()),
-            Report::Cancelled => submission.on_cancelled(),
-            Report::Trouble(trouble) => submission.on_trouble(trouble, now()),
-        }
-    }
-
-    fn client(&self) -> JobsClient<Channel> {
-        self.client.clone().expect("a submission connects first")
+    fn tell_report(&mut self, report: &str) {
+        self.console.tell_report(report);
     }
 
     fn show(&mut self, state: &JobState) {
@@ -333,7 +158,36 @@ impl Shell<'_> {
         tracing::debug!(done = state.tiles_done, count = state.tile_count, "progress");
     }
 
-    fn order(&self) -> wire::Order {
+    fn hide(&mut self) {
+        self.bar = None;
+    }
+
+    fn warn_of_obstacle(&mut self, reason: &str) {
+        tracing::warn!(reason, "the job waits");
+    }
+
+    fn warn_of_differing_tiles(&mut self, tiles: u32) {
+        tracing::warn!(
+            tiles,
+            "two workers rendered the same tile differently; one of them is broken"
+        );
+    }
+
+    fn write(
+        &self,
+        mut chunks: mpsc::Receiver<wire::Chunk>,
+    ) -> impl Future<Output = Result<(), String>> + Send + 'static {
+        let (output, stop) = (self.output.clone(), self.stop.clone());
+        async move {
+            let written = spawn_blocking(move || write_chunks(&output, &stop, &mut chunks));
+            let written = written.await.expect("writing never panics");
+            written.map_err(|error| format!("{error:#}"))
+        }
+    }
+}
+
+impl Here<'_> {
+    fn wire_order(&self) -> wire::Order {
         let request = self.args.picture.request(self.output.format());
         wire::Order {
             version: VERSION.to_owned(),
@@ -355,40 +209,12 @@ impl Shell<'_> {
     }
 }
 
-/// What a call failed of: the coordinator says it, or the connection.
-fn failed(status: &Status) -> Report {
-    let reason = plain(status.message());
-    Report::Trouble(if is_lost(status) { Trouble::Lost(reason) } else { Trouble::Call(reason) })
-}
-
-/// Says whether a call failed of its connection.
-pub(crate) fn is_lost(status: &Status) -> bool {
-    status.source().is_some()
-        || matches!(status.code(), Code::Unavailable | Code::Unknown | Code::Cancelled)
-}
-
-/// Reaches a coordinator.
-pub(crate) async fn reach(
-    address: &Address,
-) -> Result<JobsClient<Channel>, tonic::transport::Error> {
-    let client = JobsClient::new(address.connect().await?);
-    Ok(client.max_decoding_message_size(MESSAGE_BYTES).max_encoding_message_size(MESSAGE_BYTES))
-}
-
-async fn connect(address: Address, reports: mpsc::Sender<Report>) {
-    let report = match reach(&address).await.map_err(anyhow::Error::from) {
-        Ok(client) => Report::Connected(client),
-        Err(error) => Report::Trouble(Trouble::Connect(address, format!("{error:#}"))),
-    };
-    let _ = reports.send(report).await;
-}
-
-async fn submit(
-    mut client: JobsClient<Channel>,
+/// The pieces of an order, of its scene and its files.
+fn parts(
     order: wire::Order,
     text: Arc<SceneText>,
     files: BTreeMap<String, Vec<u8>>,
-) -> Report {
+) -> ReceiverStream<wire::SubmitRequest> {
     let (send, parts) = mpsc::channel(2);
     tokio::spawn(async move {
         let pieces = text.chunks(CHUNK_BYTES).map(|piece| Part::Text(piece.to_vec().into()));
@@ -407,94 +233,15 @@ async fn submit(
             }
         }
     });
-    match client.submit(ReceiverStream::new(parts)).await {
-        Ok(answer) => match read_submitted(answer.into_inner()) {
-            Ok((submitted, farm)) => Report::Submitted(submitted, farm),
-            Err(error) => nonsense(&error),
-        },
-        Err(status) => failed(&status),
-    }
+    ReceiverStream::new(parts)
 }
 
-/// Tells of a job until there is nothing more to tell.
-async fn watch(
-    mut client: JobsClient<Channel>,
-    request: wire::WatchRequest,
-    reports: mpsc::Sender<Report>,
-) {
-    let trouble = match client.watch(request).await {
-        Ok(events) => tell_events(events.into_inner(), &reports).await,
-        Err(status) => failed(&status),
-    };
-    let _ = reports.send(trouble).await;
-}
-
-/// Returns with what ends the stream of events.
-async fn tell_events(mut events: Streaming<wire::Event>, reports: &mpsc::Sender<Report>) -> Report {
-    let mut report = Report::Watching;
-    loop {
-        if reports.send(report).await.is_err() {
-            return Report::Trouble(Trouble::Gone);
-        }
-        report = match events.message().await {
-            Ok(Some(event)) => match read_event(event) {
-                Ok(state) => Report::JobState(state),
-                Err(error) => return nonsense(&error),
-            },
-            Ok(None) => return Report::Trouble(Trouble::Gone),
-            Err(status) => return failed(&status),
-        };
-    }
-}
-
-/// Brings a finished job's picture and hands it on, piece by piece.
-async fn fetch(
-    mut client: JobsClient<Channel>,
-    request: wire::ImageRequest,
-    send: mpsc::Sender<wire::Chunk>,
-    reports: mpsc::Sender<Report>,
-) {
-    let mut chunks = match client.image(request).await {
-        Ok(chunks) => chunks.into_inner(),
-        Err(status) => {
-            let _ = reports.send(failed(&status)).await;
-            return;
-        }
-    };
-    loop {
-        let _ = reports.send(Report::ChunkAwaited).await;
-        let chunk = match chunks.message().await {
-            Ok(chunk) => chunk,
-            Err(status) => {
-                let _ = reports.send(failed(&status)).await;
-                return;
-            }
-        };
-        let _ = reports.send(Report::Chunk).await;
-        // The last chunk is empty: a stream that is cut short has none.
-        let is_last = chunk.is_none();
-        if send.send(chunk.unwrap_or_default()).await.is_err() || is_last {
-            return;
-        }
-    }
-}
-
-/// Writes the picture as its pieces come, on a thread of its own.
-fn write(
-    output: Output,
-    stop: CancellationToken,
-    mut chunks: mpsc::Receiver<wire::Chunk>,
-    reports: mpsc::Sender<Report>,
-) -> JoinHandle<()> {
-    spawn_blocking(move || {
-        let written = write_chunks(&output, &stop, &mut chunks);
-        let report = match written {
-            Ok(()) => Report::Fetched,
-            Err(error) => Report::Trouble(Trouble::File(format!("{error:#}"))),
-        };
-        // Nobody listens when the submission has gone on without the picture.
-        let _ = reports.blocking_send(report);
-    })
+/// Reaches a coordinator.
+pub(crate) async fn reach(
+    address: &Address,
+) -> Result<JobsClient<Channel>, tonic::transport::Error> {
+    let client = JobsClient::new(address.connect().await?);
+    Ok(client.max_decoding_message_size(MESSAGE_BYTES).max_encoding_message_size(MESSAGE_BYTES))
 }
 
 /// Writes a picture's pieces as they come; an empty one is the last. Never call this on the async
@@ -511,44 +258,5 @@ pub(crate) fn write_chunks(
             file.write_all(&chunk.data)?;
         }
         if is_whole { Ok(()) } else { Err(io::Error::other("the picture was cut short")) }
-    })
-}
-
-/// An answer that cannot be understood.
-fn nonsense(error: &anyhow::Error) -> Report {
-    Report::Trouble(Trouble::Nonsense(format!("{error:#}")))
-}
-
-fn read_submitted(answer: wire::SubmitResponse) -> anyhow::Result<(Submitted, Bytes)> {
-    let mut farm = Bytes::new();
-    let outcome = match answer.outcome.context("it has no outcome")? {
-        submit_response::Outcome::Accepted(accepted) => {
-            farm = accepted.farm;
-            SubmitOutcome::Accepted {
-                job: JobId(accepted.job),
-                size: Size::try_from(accepted.frame.ok_or(WireError::Missing("frame"))?)?,
-            }
-        }
-        submit_response::Outcome::Refused(reason) => SubmitOutcome::Refused(plain(&reason)),
-    };
-    Ok((Submitted { outcome, report: plain(&answer.report) }, farm))
-}
-
-fn read_event(event: wire::Event) -> anyhow::Result<JobState> {
-    let end = match event.end {
-        Some(event::End::Finished(finished)) => {
-            Some(JobEnd::Finished(std::time::Duration::try_from_secs_f64(finished.seconds)?))
-        }
-        Some(event::End::Failed(reason)) => Some(JobEnd::Failed(plain(&reason))),
-        None => None,
-    };
-    Ok(JobState {
-        tiles_done: event.tiles_done,
-        tile_count: event.tile_count,
-        tally: Tally::try_from(event.tally.unwrap_or_default())?,
-        worker_count: event.workers,
-        differing_tiles: event.differing_tiles,
-        obstacle: event.obstacle,
-        end,
     })
 }

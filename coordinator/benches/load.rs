@@ -1,10 +1,12 @@
 //! What a coordinator carries: simulated workers that render nothing, each with its own connection
 //! over loopback, join at once and bring tiles of 16 x 16 pixels in time with a given rate.
 //!
-//! `cargo bench -p rtfarm-coordinator --bench load [-- WORKERS RATE TILES SECONDS FOLDER]`
+//! `cargo bench -p rtfarm-coordinator --bench load [-- WORKERS RATE TILES SECONDS FOLDER STATE SIDE]`
 //!
 //! RATE is in tiles a second, over all workers; with 0 each worker brings its next tiles as soon as it
-//! has an answer. TILES come in one delivery. The picture is made in FOLDER. Latencies are from the
+//! has an answer. TILES of SIDE x SIDE pixels, 16 by default, come in one delivery. The picture is made in
+//! FOLDER; with STATE `second` or `tile` it outlives the coordinator, which is as safe when a tile is
+//! acknowledged as with `--state` and `--durable`. Latencies are from the
 //! moment when a delivery was to be sent to its answer, processor time is that of the coordinator and
 //! the simulated workers together.
 
@@ -15,7 +17,7 @@ use std::{
     time::Duration,
 };
 
-use rtfarm_coordinator::{Config, Coordinator, Keeping, Listener, listen};
+use rtfarm_coordinator::{Config, Coordinator, Durability, Keeping, Listener, StateFolder, listen};
 use rtfarm_core::{
     render::{Quality, Sampling},
     tile::{Size, TileGrid},
@@ -38,15 +40,15 @@ const VERSION: &str = "bench";
 const SCENE: &str = "viewport\norigin 0 0 -2\ntopleft -1 1 0\nbottomleft -1 -1 0\ntopright 1 1 0\n\
     endviewport\n";
 
-/// The side of a tile in pixels.
-const SIDE: u32 = 16;
-
 #[derive(Debug, Clone, Copy)]
 struct Load {
     workers: u32,
     rate: f64,
     tiles: usize,
     time: Duration,
+    state: Option<Durability>,
+    /// The side of a tile in pixels.
+    side: u32,
 }
 
 type Error = Box<dyn std::error::Error + Send + Sync>;
@@ -61,6 +63,12 @@ fn main() -> Result<(), Error> {
         rate: word(1, "12000").parse()?,
         tiles: word(2, "4").parse()?,
         time: Duration::from_secs_f64(word(3, "10").parse()?),
+        state: match &*word(5, "none") {
+            "second" => Some(Durability::Second),
+            "tile" => Some(Durability::Tile),
+            _ => None,
+        },
+        side: word(6, "16").parse()?,
     };
     let folder = PathBuf::from(word(4, "/dev/shm"));
     tokio::runtime::Builder::new_multi_thread().enable_all().build()?.block_on(run(load, folder))
@@ -70,7 +78,8 @@ async fn run(load: Load, folder: PathBuf) -> Result<(), Error> {
     let scenes = tempfile::tempdir()?;
     let listener = listen("127.0.0.1:0".parse()?)?;
     let address: Address = format!("http://{}", listener.local_addr()?).parse()?;
-    let coordinator = Coordinator::new(Config {
+    let state = tempfile::tempdir_in(&folder)?;
+    let config = Config {
         version: VERSION.to_owned(),
         build: VERSION.to_owned(),
         reference: None,
@@ -80,10 +89,17 @@ async fn run(load: Load, folder: PathBuf) -> Result<(), Error> {
         scene_folder: scenes.path().to_owned(),
         picture_folder: folder,
         keeping: Keeping::default(),
-    })?;
+    };
+    let coordinator = match load.state {
+        None => Coordinator::new(config)?,
+        Some(durability) => {
+            let folder = StateFolder::open(state.path(), VERSION, durability)?;
+            Coordinator::with_state(config, folder)?
+        }
+    };
     let job = tokio::task::spawn_blocking({
         let coordinator = coordinator.clone();
-        move || coordinator.submit(order())
+        move || coordinator.submit(order(load.side))
     });
     let job = job.await??;
     let progress = job.progress();
@@ -135,14 +151,14 @@ async fn run(load: Load, folder: PathBuf) -> Result<(), Error> {
     Ok(())
 }
 
-fn order() -> Order {
+fn order(side: u32) -> Order {
     let request = RenderRequest {
         name: "load".to_owned(),
         strict: false,
         size: Some(Size::new(16_384, 16_384).expect("a size")),
         crop: None,
         quality: Quality { sampling: Sampling::fixed(1).expect("a number"), ..Quality::default() },
-        tile_side: Some(SIDE.into()),
+        tile_side: Some(side.into()),
         transfer: Transfer::None,
         format: PictureFormat::Png8,
     };
@@ -181,10 +197,10 @@ async fn work(
         .then(|| Duration::from_secs_f64(f64::from(load.workers) * load.tiles as f64 / load.rate));
     // Workers take turns.
     let mut due = start + period.unwrap_or_default() * number / load.workers;
-    let pixels = pixels_to_bytes(vec![[0.5; 3]; (SIDE * SIDE) as usize]);
+    let pixels = pixels_to_bytes(vec![[0.5; 3]; (load.side * load.side) as usize]);
     let mut latencies = Vec::new();
     'life: loop {
-        let tiles = lease(&mut farm, &member, &pixels).await?;
+        let tiles = lease(&mut farm, &member, load.side, &pixels).await?;
         for tiles in tiles.chunks(load.tiles) {
             if period.is_some() {
                 sleep_until(due).await;
@@ -210,6 +226,7 @@ async fn work(
 async fn lease(
     farm: &mut FarmClient<Channel>,
     member: &wire::JoinResponse,
+    side: u32,
     pixels: &Bytes,
 ) -> Result<Vec<wire::FinishedTile>, Error> {
     let request = wire::LeaseRequest {
@@ -224,7 +241,7 @@ async fn lease(
     };
     let (lease, job) = (run.lease.ok_or("no lease")?, run.job.ok_or("no job")?);
     let settings = job.settings.ok_or("no settings")?.try_into()?;
-    let grid = TileGrid::new(Size::new(16_384, 16_384)?, SIDE.into())?;
+    let grid = TileGrid::new(Size::new(16_384, 16_384)?, side.into())?;
     let hasher = TileHasher::new(JobId(lease.job), scene_hash(&job.scene_hash)?, settings, grid);
     let finish = |&tile: &u32| wire::FinishedTile {
         lease: Some(lease),

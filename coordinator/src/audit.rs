@@ -253,6 +253,23 @@ mod tests {
     }
 
     #[test]
+    fn what_a_liar_said_of_tiles_counts_no_more() {
+        const JOB: JobId = JobId(1);
+        let grid = TileGrid::new(Size::new(32, 16).unwrap(), 16).unwrap();
+        let [first, second] = [0, 1].map(|number| grid.tile(number).unwrap());
+        let [liar, honest] = [(1, 1), (2, 2)]
+            .map(|(worker, hash)| Rendering { worker: WorkerId(worker), hash: [hash; 32] });
+        let mut audit = Audit::new(1.0, [3; 32]);
+        // Of the first tile the liar's is in the picture, of the second the other's.
+        audit.begin(JOB, first, liar);
+        assert_eq!(audit.on_copy(JOB, second, honest, liar), Finding::Dispute);
+        audit.on_quarantine(liar.worker);
+        let left: Vec<_> = audit.of(JOB).collect();
+        assert_eq!(left, [(second, false, vec![honest.worker])]);
+        audit.check(|_| true);
+    }
+
+    #[test]
     fn one_percent_is_compared_and_the_first_of_each_worker_or_nothing() {
         let grid = TileGrid::new(Size::new(16_000, 1600).unwrap(), 16).unwrap();
         let tiles = || (0..grid.count()).map(|number| grid.tile(number).unwrap());

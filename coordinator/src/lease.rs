@@ -827,6 +827,15 @@ mod tests {
     }
 
     #[test]
+    fn a_lease_lives_on_while_its_tiles_come() {
+        let (mut leases, tiles, start) = all_leased(3);
+        let now = start + TERM / 2;
+        deliver(&mut leases, A, 1, tiles[0], now);
+        assert_eq!(leases.next_expiry(), Some(now + TERM));
+        assert_eq!(leases.quietest().next().unwrap().last_tile, now);
+    }
+
+    #[test]
     fn a_renewal_without_new_work_keeps_no_lease_alive() {
         let (mut leases, _, start) = all_leased(2);
         assert!(leases.on_renewal(A, &renewal(1, 7), start + TERM / 4));
@@ -845,6 +854,18 @@ mod tests {
         assert!(leases.on_renewal(A, &renewal(2, 1), start + TERM / 2));
         let lost = leases.on_time(start + TERM);
         assert_eq!(lost.iter().map(|loss| loss.lease).collect::<Vec<_>>(), [lease(1)]);
+    }
+
+    #[test]
+    fn a_lease_that_runs_out_takes_along_what_its_worker_has_not_come_to() {
+        let (mut leases, start) = job(4, 1);
+        for (id, now) in [(1, start), (2, start + TERM / 2)] {
+            assert_eq!(leases.on_idle(A, JOB, (1, 1), 1, now).unwrap().lease, lease(id));
+            assert_eq!(leases.tile_count(A) as u64, id);
+        }
+        let lost = leases.on_time(start + TERM);
+        assert_eq!(lost.iter().map(|loss| loss.lease).collect::<Vec<_>>(), [lease(1), lease(2)]);
+        assert_eq!(leases.tile_count(A), 0);
     }
 
     #[test]

@@ -252,6 +252,8 @@ impl StateFolder {
             if opened.hash() != hash {
                 return Err(damaged(SCENE, &"it is another scene"));
             }
+            // The process before may not have come to it, and what is done here counts as safe.
+            canvas.sync().map_err(|error| damaged("", &error))?;
             done = canvas.done().map_err(|error| damaged("", &error))?;
         }
         let ticket = record.ticket();
@@ -281,7 +283,7 @@ impl StateFolder {
             let canvas = Canvas::create(&begun, plan.grid, looks, &self.subject(id), &self.disk)?;
             let record = JobRecord::new(ticket, &self.build, plan);
             self.disk.replace(&begun.join(JOB), &seal(&record))?;
-            self.disk.change(|| fs::rename(&begun, &path))?;
+            self.disk.rename(&begun, &path)?;
             self.disk.sync_folder(&jobs)?;
             Ok((canvas, record))
         };
@@ -338,7 +340,7 @@ impl JobFolder {
             return Ok(());
         }
         let gone = jobs.join(format!("{GONE}{}", id.display()));
-        self.disk.change(|| fs::rename(&self.path, &gone))?;
+        self.disk.rename(&self.path, &gone)?;
         self.disk.sync_folder(jobs)?;
         self.disk.change(|| fs::remove_dir_all(&gone))
     }

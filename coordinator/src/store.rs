@@ -46,7 +46,7 @@ impl SceneFile {
         }
         let file = disk.change(|| fs::File::create_new(path))?;
         disk.write_at(&file, prepared.as_ref(), 0)?;
-        disk.change(|| file.sync_all())
+        disk.sync(&file)
     }
 
     /// A scene that an earlier process wrote.

@@ -318,3 +318,24 @@ impl Tiles {
         open
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use rtfarm_core::tile::Size;
+
+    use super::*;
+
+    #[test]
+    fn what_another_worker_confirmed_is_not_taken_back() {
+        let grid = TileGrid::new(Size::new(48, 16).unwrap(), 16).unwrap();
+        let (mut tiles, ids) = (Tiles::new(grid), [0, 1, 2].map(|tile| grid.tile(tile).unwrap()));
+        for (tile, worker) in ids.into_iter().zip([1, 1, 2].map(WorkerId)) {
+            tiles.on_pixels(tile, Rendering { worker, hash: [7; 32] });
+            tiles.on_stored(tile);
+        }
+        tiles.confirm(ids[0]);
+        assert_eq!(tiles.take_back(WorkerId(1)), [ids[1]]);
+        assert_eq!((tiles.done_count(), tiles.free_count()), (2, 1));
+        tiles.check();
+    }
+}

@@ -190,8 +190,8 @@ impl Canvas {
     /// Makes what was put so far outlive a power cut.
     pub fn sync(&self) -> io::Result<()> {
         let Some(Records { file, disk, .. }) = &self.records else { return Ok(()) };
-        disk.change(|| self.picture.sync())?;
-        disk.change(|| file.sync_data())
+        self.picture.sync()?;
+        disk.sync(file)
     }
 }
 

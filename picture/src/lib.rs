@@ -10,6 +10,6 @@ mod picture;
 mod png;
 
 pub use canvas::{Canvas, CanvasTile, TileRecord};
-pub use disk::Disk;
+pub use disk::{Cache, Disk};
 pub use format::PictureFormat;
 pub use picture::{Picture, PutError, TilePixels, pixel_bytes};

@@ -181,7 +181,7 @@ impl Picture {
 
     /// Makes what was written outlive a power cut.
     pub(crate) fn sync(&self) -> io::Result<()> {
-        self.file.sync_data()
+        self.disk.sync(&self.file)
     }
 
     /// Writes the whole picture as a file of its format. The same picture gives the same bytes.

@@ -2,7 +2,11 @@
 
 use std::{fmt, path::PathBuf, str::FromStr, time::Duration};
 
-use tonic::transport::{Channel, Endpoint};
+use tonic::{
+    body::Body,
+    client::GrpcService,
+    transport::{Channel, Endpoint},
+};
 
 /// Where a coordinator is found.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -11,6 +15,17 @@ pub enum Address {
     Unix(PathBuf),
     /// `host:port`, by TCP.
     Tcp(String),
+}
+
+/// A connection to a coordinator. A clone is the same connection.
+pub trait Connection:
+    GrpcService<Body, ResponseBody = Body, Future: Send> + Clone + Send + Sync + 'static
+{
+}
+
+impl<C> Connection for C where
+    C: GrpcService<Body, ResponseBody = Body, Future: Send> + Clone + Send + Sync + 'static
+{
 }
 
 /// A text that is no address of a coordinator.

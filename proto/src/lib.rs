@@ -7,7 +7,7 @@ mod convert;
 mod name;
 mod tile_hash;
 
-pub use address::{Address, AddressError};
+pub use address::{Address, AddressError, Connection};
 pub use convert::{WireError, pixels_to_bytes, scene_hash, transfer};
 pub use name::{FarmId, Incarnation, JobId, LeaseId, LeaseName, Renewal, WorkerId};
 pub use prost::bytes::Bytes;

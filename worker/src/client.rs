@@ -4,7 +4,7 @@
 use std::{sync::Arc, time::Duration};
 
 use rtfarm_proto::{
-    FarmId, Incarnation, LeaseName, MESSAGE_BYTES, PROTOCOL, WireError, WorkerId,
+    Connection, FarmId, Incarnation, LeaseName, MESSAGE_BYTES, PROTOCOL, WireError, WorkerId,
     wire::{self, farm_client::FarmClient, lease_response},
 };
 use tonic::{Code, Status};
@@ -13,7 +13,6 @@ use crate::{
     call::{Answer, Call, CallError, CallErrorKind, Delivery, KeptTiles, Membership, Next, Run},
     config::Config,
     job::{Job, JobError},
-    outside::Connection,
 };
 
 /// Speaks over a connection.

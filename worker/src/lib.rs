@@ -32,8 +32,5 @@ pub use scene::SceneError;
 /// A door for simulations.
 #[doc(hidden)]
 pub mod simulation {
-    pub use crate::{
-        outside::{Connection, Outside},
-        run::run_in,
-    };
+    pub use crate::{outside::Outside, run::run_in};
 }

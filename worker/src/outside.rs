@@ -3,20 +3,9 @@
 use std::{error::Error, panic::resume_unwind};
 
 use rayon::{ThreadPool, ThreadPoolBuildError, ThreadPoolBuilder};
-use rtfarm_proto::Address;
+use rtfarm_proto::{Address, Connection};
 use tokio::time::Instant;
-use tonic::{body::Body, client::GrpcService, transport::Channel};
-
-/// A connection to a coordinator. A clone is the same connection.
-pub trait Connection:
-    GrpcService<Body, ResponseBody = Body, Future: Send> + Clone + Send + Sync + 'static
-{
-}
-
-impl<C> Connection for C where
-    C: GrpcService<Body, ResponseBody = Body, Future: Send> + Clone + Send + Sync + 'static
-{
-}
+use tonic::transport::Channel;
 
 /// What a worker reaches the world by.
 pub trait Outside: Send + Sync + 'static {

@@ -10,11 +10,14 @@ use std::{
 };
 
 use rtfarm_core::prepared::{PreparedError, PreparedScene};
-use rtfarm_proto::wire::{self, farm_client::FarmClient};
+use rtfarm_proto::{
+    Connection,
+    wire::{self, farm_client::FarmClient},
+};
 use rustix::fs::OFlags;
 use tonic::{Code, Status};
 
-use crate::{job::Job, map::Map, outside::Connection};
+use crate::{job::Job, map::Map};
 
 pub(crate) type Scene = PreparedScene<Map>;
 

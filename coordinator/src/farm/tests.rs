@@ -184,12 +184,20 @@ fn a_call_meant_for_another_incarnation_is_refused_and_counted() {
 }
 
 #[test]
+fn a_job_is_published_from_its_first_tile_on() {
+    let (_, actions) = World::new().submit(2);
+    assert!(actions.is_empty(), "{actions:?}");
+}
+
+#[test]
 fn incarnations_number_their_jobs_differently() {
     let identities = [[1; 24], [2; 24]].map(Identity::from_random);
     let mut farms = identities.map(|identity| Farm::new(identity, TERM, Audit::new(0.0, [0; 32])));
     let numbers: BTreeSet<JobId> =
         farms.iter_mut().flat_map(|farm| [farm.number_job(), farm.number_job()]).collect();
     assert_eq!(numbers.len(), 4);
+    let far_apart = |job: &&JobId| job.0 >> 24 == 0x01_0101_0101 || job.0 >> 24 == 0x02_0202_0202;
+    assert_eq!(numbers.iter().filter(far_apart).count(), 4, "no start has so many jobs");
 }
 
 #[test]
@@ -527,6 +535,20 @@ fn a_tile_that_kills_its_workers_is_set_aside_and_the_others_are_finished() {
         }
     }
     assert!(world.farm.ended.len() == 1);
+}
+
+#[test]
+fn who_has_a_suspect_gets_no_tiles_that_it_offers() {
+    let mut world = World::new();
+    let (job, _) = world.submit(2);
+    let dead = world.join();
+    let process = world.last_number as u32;
+    let suspect = world.lease(dead).tiles;
+    world.farm.on_process_exit(process, "killed by signal 11", world.now);
+    let worker = world.join();
+    assert_eq!(world.lease(worker).tiles, suspect);
+    assert_eq!(world.farm.on_offer(worker, job, &[0, 1], world.now), None);
+    world.farm.check();
 }
 
 #[test]

@@ -1,6 +1,6 @@
 //! A client's side of one job: it submits a scene, watches the job, fetches the picture and has
-//! the farm forget the job; a detached one ends when it knows its job. Decisions alone: what happens comes in as events with the time, what
-//! is to be done goes out as [`Action`]s, and nothing here waits.
+//! the farm forget the job; a detached one ends when it knows its job. Decisions alone: what happens
+//! comes in as events with the time, what is to be done goes out as [`Action`]s, and nothing here waits.
 
 use std::{
     collections::VecDeque,
@@ -8,13 +8,11 @@ use std::{
     time::{Duration, Instant},
 };
 
-use anyhow::anyhow;
 use rtfarm_core::{render::Tally, tile::Size};
 use rtfarm_proto::{Address, JobId};
 
-use crate::failure::Failure;
-
-/// What the shell is to do. All but [`Action::TellReport`], [`Action::Show`] and the warnings end what was being done before.
+/// What the shell is to do. All but [`Action::TellReport`], [`Action::Show`] and the warnings end what
+/// was being done before.
 #[derive(Debug)]
 pub(crate) enum Action {
     /// Reach the coordinator.
@@ -36,7 +34,7 @@ pub(crate) enum Action {
     /// Have the farm forget the job.
     Cancel(JobId),
     /// End; nothing comes after this.
-    End(Result<Ended, Failure>),
+    End(Result<Ended, NoPicture>),
 }
 
 /// What came of submitting a scene.
@@ -59,21 +57,26 @@ pub(crate) enum SubmitOutcome {
 
 /// How far a job is.
 #[derive(Debug, Clone, PartialEq)]
-pub(crate) struct JobState {
-    pub(crate) tiles_done: u32,
-    pub(crate) tile_count: u32,
-    pub(crate) tally: Tally,
+pub struct JobState {
+    /// Tiles in the picture.
+    pub tiles_done: u32,
+    /// Those and the others.
+    pub tile_count: u32,
+    /// What the tiles in the picture took, and how good they are.
+    pub tally: Tally,
     /// Workers that have delivered something.
-    pub(crate) worker_count: u32,
+    pub worker_count: u32,
     /// Tiles with a second copy that differed from the first.
-    pub(crate) differing_tiles: u32,
+    pub differing_tiles: u32,
     /// Why the job does not get further, unless that may change by itself; otherwise empty.
-    pub(crate) obstacle: String,
-    pub(crate) end: Option<JobEnd>,
+    pub obstacle: String,
+    /// How it ended, when it has.
+    pub end: Option<JobEnd>,
 }
 
+/// How a job ended.
 #[derive(Debug, Clone, PartialEq)]
-pub(crate) enum JobEnd {
+pub enum JobEnd {
     /// The time from the job's start to its last tile.
     Finished(Duration),
     /// Why there is no picture.
@@ -82,25 +85,52 @@ pub(crate) enum JobEnd {
 
 /// What there is to say of a picture that was written.
 #[derive(Debug, Clone, PartialEq)]
-pub(crate) struct Finished {
-    pub(crate) size: Size,
-    pub(crate) tally: Tally,
-    pub(crate) worker_count: u32,
-    pub(crate) rendering: Duration,
+pub struct Finished {
+    /// In pixels.
+    pub size: Size,
+    /// What its tiles took, and how good they are.
+    pub tally: Tally,
+    /// Workers that brought tiles.
+    pub worker_count: u32,
+    /// From the job's start to its last tile.
+    pub rendering: Duration,
 }
 
 /// What a submission came to.
 #[derive(Debug, Clone, PartialEq)]
-pub(crate) enum Ended {
+pub enum Ended {
     /// The job's picture was written.
     Finished(JobId, Finished),
     /// The job goes on by itself.
     Detached(JobId, Size),
 }
 
+/// Why there is no picture.
+#[derive(Debug, Clone, PartialEq)]
+pub enum NoPicture {
+    /// The farm does not take the scene, for that reason.
+    Refused(String),
+    /// The same, and the coordinator's report has told why.
+    Told,
+    /// Something failed.
+    Failed(String),
+    /// Somebody stopped it.
+    Interrupted,
+}
+
+impl fmt::Display for NoPicture {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Refused(reason) | Self::Failed(reason) => f.write_str(reason),
+            Self::Told => Ok(()),
+            Self::Interrupted => f.write_str("interrupted"),
+        }
+    }
+}
+
 /// What goes wrong on the way.
 #[derive(Debug, Clone, PartialEq)]
-pub(crate) enum Trouble {
+pub enum Trouble {
     /// Nobody answers at the address.
     Connect(Address, String),
     /// The coordinator says why it does not do what was asked.
@@ -152,9 +182,10 @@ const CHUNK_DEADLINE: Duration = Duration::from_secs(30);
 
 /// The pause before a coordinator that is gone is looked for. It doubles each time, up to
 /// [`LONGEST_PAUSE`].
-pub(crate) const FIRST_PAUSE: Duration = Duration::from_millis(100);
+pub const FIRST_PAUSE: Duration = Duration::from_millis(100);
 
-pub(crate) const LONGEST_PAUSE: Duration = Duration::from_secs(2);
+/// The longest pause.
+pub const LONGEST_PAUSE: Duration = Duration::from_secs(2);
 
 /// A client's side of one job.
 #[derive(Debug)]
@@ -196,7 +227,7 @@ enum Stage {
     },
     /// The job is being forgotten; then the submission ends so.
     Cancelling {
-        end: Result<Ended, Failure>,
+        end: Result<Ended, NoPicture>,
     },
     Ended,
 }
@@ -262,11 +293,11 @@ impl Submission {
             SubmitOutcome::Accepted { job, size } => {
                 self.enter(Stage::Watching { job, size }, Action::Watch(job), now + DEADLINE);
             }
-            SubmitOutcome::Refused(reason) if reason.is_empty() => self.end(Err(Failure::Told)),
+            SubmitOutcome::Refused(reason) if reason.is_empty() => self.end(Err(NoPicture::Told)),
             SubmitOutcome::Refused(reason) => {
                 let scene = &self.scene;
-                let error = anyhow!("the farm cannot render {scene}: {reason}");
-                self.end(Err(Failure::Input(error)));
+                let reason = format!("the farm cannot render {scene}: {reason}");
+                self.end(Err(NoPicture::Refused(reason)));
             }
         }
     }
@@ -301,7 +332,7 @@ impl Submission {
                 self.enter(fetching, Action::Fetch(job), now + IMAGE_DEADLINE);
             }
             Some(JobEnd::Failed(reason)) => {
-                self.cancel(job, Err(Failure::Other(anyhow!("the job failed: {reason}"))), now);
+                self.cancel(job, Err(NoPicture::Failed(format!("the job failed: {reason}"))), now);
             }
         }
     }
@@ -342,28 +373,30 @@ impl Submission {
             // The picture is not at fault: it stays where it is.
             (Stage::Fetching { job, .. }, Trouble::File(reason)) => {
                 let (job, coordinator) = (*job, &self.coordinator);
-                self.end(Err(Failure::Other(anyhow!(
+                self.end(Err(NoPicture::Failed(format!(
                     "{reason}; the farm keeps the picture for a while: rtfarm image {job} \
                      --coordinator {coordinator} -o FILE fetches it"
                 ))));
             }
+            // The writer of a picture that was cut short; why is known.
+            (Stage::Reconnecting { .. }, Trouble::File(_)) => {}
             (&Stage::Watching { job, size }, trouble) => {
-                self.find_again(Some((job, size)), trouble, now);
+                self.find_again(Some((job, size)), &trouble, now);
             }
-            (&Stage::Reconnecting { job, .. }, trouble) => self.find_again(job, trouble, now),
+            (&Stage::Reconnecting { job, .. }, trouble) => self.find_again(job, &trouble, now),
             (Stage::Fetching { job, finished }, trouble) => {
-                self.find_again(Some((*job, finished.size)), trouble, now);
+                self.find_again(Some((*job, finished.size)), &trouble, now);
             }
             (Stage::Submitting, trouble @ (Trouble::Lost(_) | Trouble::Gone)) => {
-                self.find_again(None, trouble, now);
+                self.find_again(None, &trouble, now);
             }
-            (_, trouble) => self.give_up(Failure::Other(anyhow::Error::msg(trouble)), now),
+            (_, trouble) => self.give_up(NoPicture::Failed(trouble.to_string()), now),
         }
     }
 
     /// Looks for a coordinator that is gone and may have the job, unless it was gone for too long. One
     /// that keeps its jobs will have it.
-    fn find_again(&mut self, job: Option<(JobId, Size)>, trouble: Trouble, now: Instant) {
+    fn find_again(&mut self, job: Option<(JobId, Size)>, trouble: &Trouble, now: Instant) {
         let may_be_gone = matches!(
             trouble,
             Trouble::Connect(..) | Trouble::Lost(_) | Trouble::Late | Trouble::Gone
@@ -371,7 +404,7 @@ impl Submission {
         let until = *self.gone_since.get_or_insert(now) + self.patience;
         let again_at = now + self.pause;
         if !may_be_gone || until <= again_at {
-            return self.give_up(Failure::Other(anyhow::Error::msg(trouble)), now);
+            return self.give_up(NoPicture::Failed(trouble.to_string()), now);
         }
         self.pause = LONGEST_PAUSE.min(self.pause * 2);
         self.stage = Stage::Reconnecting { job, is_pausing: true };
@@ -397,7 +430,7 @@ impl Submission {
         match self.stage {
             // What was reached is told, and the farm is already being told to forget the job.
             Stage::Cancelling { .. } => {}
-            _ => self.give_up(Failure::Interrupted, now),
+            _ => self.give_up(NoPicture::Interrupted, now),
         }
     }
 
@@ -407,7 +440,7 @@ impl Submission {
         self.actions.push_back(action);
     }
 
-    fn give_up(&mut self, failure: Failure, now: Instant) {
+    fn give_up(&mut self, failure: NoPicture, now: Instant) {
         match self.stage {
             Stage::Connecting | Stage::Submitting | Stage::Reconnecting { job: None, .. } => {
                 self.end(Err(failure));
@@ -421,7 +454,7 @@ impl Submission {
         }
     }
 
-    fn cancel(&mut self, job: JobId, end: Result<Ended, Failure>, now: Instant) {
+    fn cancel(&mut self, job: JobId, end: Result<Ended, NoPicture>, now: Instant) {
         self.enter(Stage::Cancelling { end }, Action::Cancel(job), now + CANCEL_DEADLINE);
     }
 
@@ -431,7 +464,7 @@ impl Submission {
         }
     }
 
-    fn end(&mut self, end: Result<Ended, Failure>) {
+    fn end(&mut self, end: Result<Ended, NoPicture>) {
         self.stage = Stage::Ended;
         self.deadline = None;
         self.actions.push_back(Action::End(end));
@@ -520,7 +553,7 @@ mod tests {
         }
 
         /// The names of the actions since the last time, and how the submission ended.
-        fn actions(&mut self) -> (Vec<String>, Option<Result<Ended, Failure>>) {
+        fn actions(&mut self) -> (Vec<String>, Option<Result<Ended, NoPicture>>) {
             let mut names = Vec::new();
             let mut end = None;
             while let Some(action) = self.submission.next_action() {
@@ -546,7 +579,12 @@ mod tests {
             let (names, end) = self.actions();
             assert!(names.ends_with(&expected.iter().map(ToString::to_string).collect::<Vec<_>>()));
             let failure = end.expect("an end").expect_err("a failure");
-            assert_eq!((failure.exit_code(), failure.to_string().as_str()), (code, message));
+            let of_kind = match failure {
+                NoPicture::Failed(_) => 1,
+                NoPicture::Refused(_) | NoPicture::Told => 2,
+                NoPicture::Interrupted => 130,
+            };
+            assert_eq!((of_kind, failure.to_string().as_str()), (code, message));
         }
 
         /// Lets time pass until the submission wants to be woken; answers with how long it slept.
@@ -665,6 +703,18 @@ mod tests {
             bench.submission.on_trouble(lost(), bench.now);
             assert_eq!(bench.sleep(), FIRST_PAUSE, "it was there again");
         }
+    }
+
+    #[test]
+    fn a_picture_that_is_cut_short_is_fetched_again() {
+        let mut bench = Bench::fetching();
+        bench.actions();
+        bench.submission.on_chunk();
+        bench.submission.on_trouble(Trouble::Lost("broken pipe".to_owned()), bench.now);
+        bench.submission.on_trouble(Trouble::File("it was cut short".to_owned()), bench.now);
+        bench.check_actions(&[]);
+        assert_eq!(bench.sleep(), FIRST_PAUSE);
+        bench.check_actions(&["Connect"]);
     }
 
     #[test]

@@ -1,7 +1,7 @@
 //! Text from others as it may reach a terminal or a log.
 
 /// Leaves out control characters, by which a text could command a terminal; lines and tabs stay.
-pub(crate) fn plain(text: &str) -> String {
+pub fn plain(text: &str) -> String {
     text.chars().filter(|&c| !c.is_control() || matches!(c, '\n' | '\t')).collect()
 }
 
