@@ -101,6 +101,7 @@ pub fn prepare_with(
         solids: &faces.solids,
         solid_nodes: &faces.solid_nodes,
         leaves: &faces.leaves,
+        box_planes: &faces.box_planes,
         solid_boxes: &faces.solid_boxes,
         first_ranks: &ranks.firsts,
         emitters: &emitters.records,

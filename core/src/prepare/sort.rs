@@ -6,8 +6,8 @@ use super::{flat::FaceAttributes, surfaces::Surfaces};
 use crate::prepared::{
     node::Node,
     record::{
-        CoplanarRecord, Item, Kind, LeafRecord, PlaneRecord, QuadrangleRecord, SolidNodeRecord,
-        SolidRecord, SphereRecord, TriangleRecord,
+        BoxPlanes, CoplanarRecord, Item, Kind, LeafRecord, PlaneRecord, QuadrangleRecord,
+        SolidNodeRecord, SolidRecord, SphereRecord, TriangleRecord,
     },
 };
 
@@ -24,6 +24,7 @@ pub(super) struct Sorted {
     pub(super) solids: Vec<SolidRecord>,
     pub(super) solid_nodes: Vec<SolidNodeRecord>,
     pub(super) leaves: Vec<LeafRecord>,
+    pub(super) box_planes: Vec<BoxPlanes>,
     pub(super) solid_boxes: Vec<Node>,
     /// The same solids in file order.
     pub(super) solids_in_file_order: Vec<SolidRecord>,
@@ -93,6 +94,7 @@ impl Surfaces {
             solids,
             solid_nodes: self.solid_nodes,
             leaves: self.leaves,
+            box_planes: self.box_planes,
             solid_boxes: self.solid_boxes,
             solids_in_file_order,
             solid_bounds: self.solid_bounds,

@@ -11,7 +11,9 @@ use super::{
 };
 use crate::prepared::{
     node::Node,
-    record::{LeafRecord, PlaneIndex, PlaneRecord, SolidNodeRecord, SolidRecord, SphereRecord},
+    record::{
+        BoxPlanes, LeafRecord, PlaneIndex, PlaneRecord, SolidNodeRecord, SolidRecord, SphereRecord,
+    },
 };
 use glam::DVec3;
 
@@ -31,6 +33,8 @@ pub(super) struct Surfaces {
     pub(super) solid_bounds: Vec<(DVec3, DVec3)>,
     pub(super) solid_nodes: Vec<SolidNodeRecord>,
     pub(super) leaves: Vec<LeafRecord>,
+    /// The planes of the parallelepipeds among the leaves.
+    pub(super) box_planes: Vec<BoxPlanes>,
     /// The hierarchies over the leaves of each solid.
     pub(super) solid_boxes: Vec<Node>,
 }
@@ -44,25 +48,30 @@ impl Welded {
         let sphere_surfaces = share_spheres(&mut spheres, &solids);
         let SolidTrees { mut solids, bounds, nodes, leaves } = solids;
         let leaf_bounds = leaf_bounds(&leaves, &flat);
-        let mut of_boxes = of_boxes.into_iter();
+        let box_planes: Vec<_> =
+            of_boxes.iter().map(|&faces| BoxPlanes::new(faces, &planes)).collect();
+        let mut of_boxes = (0..).zip(of_boxes);
         let leaves = leaves
             .into_iter()
             .zip(sphere_surfaces)
             .zip(&leaf_bounds)
-            .map(|((leaf, surface), (min, max))| LeafRecord {
-                center: leaf.center.to_array(),
-                radius: leaf.radius,
-                planes: if leaf.is_box() {
+            .map(|((leaf, sphere), (min, max))| {
+                let (surface, planes) = if leaf.is_box() {
                     of_boxes.next().expect("as many boxes as there are among the leaves")
                 } else {
-                    [PlaneIndex::new(0, false); 6]
-                },
-                material: leaf.material,
-                node: leaf.node,
-                is_reversed: u32::from(leaf.is_reversed),
-                surface,
-                // All of it is in the box, and 4 ulp more are enough for the length's rounding.
-                extent: 2.0 * min.abs().max(max.abs()).length() * (1.0 + 4.0 * f64::EPSILON),
+                    (sphere, [PlaneIndex::new(0, false); 6])
+                };
+                LeafRecord {
+                    center: leaf.center.to_array(),
+                    radius: leaf.radius,
+                    planes,
+                    material: leaf.material,
+                    node: leaf.node,
+                    is_reversed: u32::from(leaf.is_reversed),
+                    surface,
+                    // All of it is in the box, and 4 ulp more are enough for the length's rounding.
+                    extent: 2.0 * min.abs().max(max.abs()).length() * (1.0 + 4.0 * f64::EPSILON),
+                }
             })
             .collect::<Vec<_>>();
         let mut solid_boxes = Vec::new();
@@ -82,6 +91,7 @@ impl Welded {
             solid_bounds: bounds,
             solid_nodes: nodes,
             leaves,
+            box_planes,
             solid_boxes,
         }
     }

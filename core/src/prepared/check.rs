@@ -67,11 +67,16 @@ pub(super) fn check(view: &View<'_>) -> Result<(), &'static str> {
         let has_texture = (record.texture as usize) < view.textures.len();
         ensure(has_texture || record.texture == MaterialRecord::PLAIN, "a material")?;
     }
+    for planes in view.box_planes {
+        let numbers = [planes.points.as_flattened(), planes.normals.as_flattened()];
+        ensure(numbers.into_iter().all(finite), "a parallelepiped")?;
+    }
     for leaf in view.leaves {
         let whole = finite(&leaf.center) && finite(&[leaf.radius]) && material(leaf.material);
-        let is_shape = leaf.is_sphere() || leaf.planes.iter().all(|&index| plane(index));
+        let is_box = leaf.planes.iter().all(|&index| plane(index))
+            && (leaf.surface as usize) < view.box_planes.len();
         let has_extent = finite(&[leaf.extent]) && leaf.extent > 0.0;
-        ensure(whole && is_shape && has_extent, "a leaf")?;
+        ensure(whole && (leaf.is_sphere() || is_box) && has_extent, "a leaf")?;
     }
     for solid in view.solids {
         ensure(solid.nodes().end <= view.solid_nodes.len(), "a solid")?;

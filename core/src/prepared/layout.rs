@@ -3,7 +3,7 @@
 use super::{
     node::{Frame, Node},
     record::{
-        Camera, CoplanarRecord, EmitterNode, EmitterRecord, Features, Item, LeafRecord,
+        BoxPlanes, Camera, CoplanarRecord, EmitterNode, EmitterRecord, Features, Item, LeafRecord,
         LevelRecord, LightRecord, Lighting, MaterialRecord, PlaneRecord, QuadrangleRecord,
         SolidNodeRecord, SolidRecord, SphereRecord, Surface, TextureRecord, TexturedFace,
         TriangleRecord,
@@ -13,7 +13,7 @@ use super::{
 pub(super) const MAGIC: [u8; 8] = *b"rtfarm\r\n";
 
 /// The version changes with the layout or the meaning of any byte.
-pub(super) const VERSION: u32 = 7;
+pub(super) const VERSION: u32 = 8;
 
 /// This number reads differently on a machine of the other byte order.
 pub(super) const BYTE_ORDER: u32 = 0x0102_0304;
@@ -88,6 +88,7 @@ sections! {
     solids: SolidRecord,
     solid_nodes: SolidNodeRecord,
     leaves: LeafRecord,
+    box_planes: BoxPlanes,
     solid_boxes: Node,
     first_ranks: u32,
     emitters: EmitterRecord,

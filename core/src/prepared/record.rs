@@ -301,6 +301,17 @@ pub(crate) struct SolidNodeRecord {
     pub(crate) dies_at: u32,
     /// If nothing is left of this node, the leaves before this one make no difference any more.
     pub(crate) rest: u32,
+    pub(super) padding: u32,
+    /// A bit for each other operand of its parent, in a solid of at most [`Self::BITS`] nodes. If
+    /// those that the ray is inside are just those of `needed`, then the ray enters or leaves the
+    /// parent with this node. The root has no siblings, and what is needed never is.
+    pub(crate) siblings: u64,
+    pub(crate) needed: u64,
+}
+
+impl SolidNodeRecord {
+    /// Nodes of a solid that has no more than these have a bit each, by their indices.
+    pub(crate) const BITS: usize = 64;
 }
 
 /// A leaf of a constructive solid: a sphere, or a parallelepiped by its planes.
@@ -317,8 +328,8 @@ pub(crate) struct LeafRecord {
     pub(crate) node: u32,
     /// 1 where an odd number of differences takes it away, so that its faces look inward.
     pub(crate) is_reversed: u32,
-    /// Equal spheres have one surface, within solids or without. That of a parallelepiped means
-    /// nothing: its faces have the surfaces of their planes.
+    /// Equal spheres have one surface, within solids or without. Of a parallelepiped it is the place
+    /// in the section `box_planes`: its faces have the surfaces of their planes.
     pub(crate) surface: u32,
     /// Twice the distance of its farthest point from the origin, or a little more: the size of the
     /// numbers that rounding counts by.
@@ -335,6 +346,29 @@ impl LeafRecord {
     #[inline(always)]
     pub(crate) fn surface(&self, face: usize) -> Surface {
         if self.is_sphere() { Surface(self.surface) } else { self.planes[face].surface() }
+    }
+}
+
+/// The planes of a parallelepiped side by side: [axis][face], as its faces look.
+#[derive(Debug, Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
+#[repr(C)]
+pub(crate) struct BoxPlanes {
+    pub(crate) points: [[f64; 6]; 3],
+    /// The normals look outward.
+    pub(crate) normals: [[f64; 6]; 3],
+}
+
+impl BoxPlanes {
+    /// Gathers the planes of six faces.
+    pub(crate) fn new(faces: [PlaneIndex; 6], planes: &[PlaneRecord]) -> Self {
+        let record = |face: usize| &planes[faces[face].index()];
+        let side_by_side = |number: &dyn Fn(usize, usize) -> f64| {
+            std::array::from_fn(|axis| std::array::from_fn(|face| number(axis, face)))
+        };
+        Self {
+            points: side_by_side(&|axis, face| record(face).point[axis]),
+            normals: side_by_side(&|axis, face| record(face).normal[axis] * faces[face].sign()),
+        }
     }
 }
 

@@ -35,10 +35,16 @@ pub(crate) fn link_solid(
             jump: index,
             dies_at: NO_NODE,
             rest: leaf_count,
+            padding: 0,
+            siblings: 0,
+            needed: u64::MAX,
         });
     }
     if waiting.len() != 1 {
         return None;
+    }
+    if records.len() <= SolidNodeRecord::BITS {
+        link_siblings(&mut records);
     }
     let mut depths = vec![0; records.len()];
     for index in (0..records.len() - 1).rev() {
@@ -62,4 +68,24 @@ pub(crate) fn link_solid(
         }
     }
     Some(records)
+}
+
+/// Finds what decides whether the ray enters and leaves the parents of nodes with them.
+fn link_siblings(records: &mut [SolidNodeRecord]) {
+    let mut operands = [0_u64; SolidNodeRecord::BITS];
+    let root = records.len() - 1;
+    for (index, record) in records[..root].iter().enumerate() {
+        operands[record.parent as usize] |= 1 << index;
+    }
+    for index in 0..root {
+        let parent = records[records[index].parent as usize];
+        let first = 1 << parent.first_child;
+        let siblings = operands[records[index].parent as usize] & !(1 << index);
+        records[index].siblings = siblings;
+        records[index].needed = match parent.kind {
+            SolidNodeKind::UNION => 0,
+            SolidNodeKind::INTERSECTION => siblings,
+            _ => siblings & first,
+        };
+    }
 }

@@ -4,9 +4,10 @@ use glam::DVec3;
 
 use super::{
     boxes::{BoxKernel, BoxRay},
+    course::Crossing,
     quadrangle::{hit_plane, hit_quadrangle, is_inside},
     ray::{Hit, Ray, Shear},
-    solid::{Crossing, Scratch},
+    solid::Scratch,
     sphere::{hit_sphere, hit_sphere_again},
     triangle::hit_triangle,
 };

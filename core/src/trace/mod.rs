@@ -5,8 +5,13 @@ mod boxes;
 #[cfg(target_arch = "x86_64")]
 #[expect(unsafe_code, reason = "SIMD intrinsics")]
 mod boxes_x86;
+mod course;
 mod hit;
 mod kernels;
+mod parallelepiped;
+#[cfg(target_arch = "x86_64")]
+#[expect(unsafe_code, reason = "SIMD intrinsics")]
+mod parallelepiped_x86;
 pub(crate) mod probe;
 pub(crate) mod quadrangle;
 pub(crate) mod ray;
@@ -14,3 +19,4 @@ pub(crate) mod solid;
 pub(crate) mod sphere;
 pub(crate) mod traversal;
 pub(crate) mod triangle;
+mod walk;

@@ -9,228 +9,23 @@
 //! so neither the number of leaves nor the depth of nesting costs time, and nothing recurses.
 //! docs/proof.md says why what is passed over changes no bit.
 
-use glam::DVec3;
-
 use super::{
     boxes::{BoxKernel, BoxRay},
-    quadrangle::toward_plane,
+    course::{Course, Crossing, End, Pin},
     ray::Ray,
-    sphere::{hit_sphere, hit_sphere_again},
+    walk::{Walk, Walked},
 };
 use crate::prepared::{
-    face::Part,
     layout::View,
     node::Child,
-    record::{
-        LeafRecord, NO_NODE, PlaneRecord, SolidNodeKind, SolidNodeRecord, SolidRecord, Surface,
-    },
+    record::{NO_NODE, SolidNodeKind, SolidNodeRecord, SolidRecord, Surface},
 };
 
-/// Where a ray crosses a solid's surface.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct Crossing {
-    /// In units of the ray's direction.
-    pub(super) t: f64,
-    pub(super) part: Part,
-}
-
-/// The bounds of a crossing's rounding, across the face, in ulp of what [`Course::doubt`] counts
-/// by: docs/proof.md.
-const SPHERE_ULP: f64 = 6.0;
-const PLANE_ULP: f64 = 10.0;
+/// The leaves of a solid that has no more than these are all met.
+const FEW_LEAVES: usize = 3;
 
 /// Leaves that are collected before the first look at what they make.
 const FIRST_LOOK: usize = 12;
-
-/// Where a stretch of the ray inside something begins or ends.
-#[derive(Debug, Clone, Copy, PartialEq)]
-struct End {
-    /// Along the course.
-    t: f64,
-    /// Rounding may have moved it as far as these.
-    low: f64,
-    high: f64,
-    part: Part,
-    /// The place among the operands that are being joined.
-    operand: u32,
-    /// Whether the stretch begins here.
-    enters: bool,
-    pin: Pin,
-}
-
-/// Whether it is known exactly where an end is.
-#[derive(Debug, Clone, Copy, PartialEq)]
-enum Pin {
-    No,
-    /// On the surface that the ray leaves.
-    Start,
-    /// On the surface that it ends on.
-    Goal,
-}
-
-/// A ray on its way through a solid. It starts near the solid, wherever the ray does: so rounding is
-/// as fine as the solid.
-struct Course<'a> {
-    view: &'a View<'a>,
-    solid: &'a SolidRecord,
-    nodes: &'a [SolidNodeRecord],
-    leaves: &'a [LeafRecord],
-    ending_on: &'a [Surface],
-    ray: &'a Ray,
-    /// The ray from its start on the course, with its end there.
-    near: Ray,
-    /// The course starts here on the ray.
-    start: f64,
-    /// The length of the vector to where it starts.
-    size: f64,
-}
-
-impl<'a> Course<'a> {
-    fn new(
-        view: &'a View<'a>,
-        solid: &'a SolidRecord,
-        ray: &'a Ray,
-        ending_on: &'a [Surface],
-    ) -> Self {
-        let ahead = (DVec3::from_array(solid.frame.origin) - ray.origin).dot(ray.direction);
-        let start = if ahead.abs() * solid.frame.scale > 8.0 { ahead } else { 0.0 };
-        let origin = ray.origin + start * ray.direction;
-        Self {
-            view,
-            solid,
-            nodes: view.solid_nodes(solid),
-            leaves: view.solid_leaves(solid),
-            ending_on,
-            ray,
-            near: Ray { origin, reach: ray.reach - start, ..*ray },
-            start,
-            size: origin.length(),
-        }
-    }
-
-    /// How far rounding may move a crossing of a leaf along the ray, which meets it at a cosine. No
-    /// more than the boxes of leaves have for it.
-    fn doubt(&self, leaf: &LeafRecord, ulp: f64, t: f64, cosine: f64) -> f64 {
-        let bound = ulp * f64::EPSILON * (leaf.extent + self.size + t.abs()) / cosine;
-        bound.min(self.solid.margin / 8.0)
-    }
-
-    /// An end of the stretch inside a leaf; rounding moves it no farther than its doubt.
-    #[inline(always)]
-    fn end(
-        &self,
-        (leaf, ulp): (&LeafRecord, f64),
-        (t, cosine): (f64, f64),
-        (part, pin): (Part, Pin),
-        enters: bool,
-    ) -> End {
-        let doubt = if pin == Pin::No { self.doubt(leaf, ulp, t, cosine) } else { 0.0 };
-        End { t, low: t - doubt, high: t + doubt, part, operand: 0, enters, pin }
-    }
-
-    /// The stretch of the ray's line that is inside a leaf; `None` if there is none, or none that
-    /// rounding leaves.
-    #[inline(always)]
-    fn meet_leaf(&self, number: u32) -> Option<[End; 2]> {
-        let leaf = &self.leaves[number as usize];
-        let ends = if leaf.is_sphere() {
-            self.meet_sphere(number, leaf)?
-        } else {
-            self.meet_box(number, leaf)?
-        };
-        (ends[0].high < ends[1].low).then_some(ends)
-    }
-
-    /// Where the line enters and leaves a sphere.
-    #[inline(always)]
-    fn meet_sphere(&self, number: u32, leaf: &LeafRecord) -> Option<[End; 2]> {
-        let center = DVec3::from_array(leaf.center);
-        let surface = Surface(leaf.surface);
-        let is_left = self.ray.leaving == surface;
-        let is_goal = self.ending_on.contains(&surface);
-        let (ends, pins) = if is_left && is_goal {
-            ([-self.start, self.near.reach], [Pin::Start, Pin::Goal])
-        } else if is_left {
-            let again = hit_sphere_again(self.ray, center);
-            let ends = [again.min(0.0) - self.start, again.max(0.0) - self.start];
-            (ends, if again > 0.0 { [Pin::Start, Pin::No] } else { [Pin::No, Pin::Start] })
-        } else if is_goal {
-            let end = self.ray.origin + self.ray.reach * self.ray.direction;
-            let again = hit_sphere_again(&Ray { origin: end, ..*self.ray }, center);
-            let ends = [self.near.reach + again.min(0.0), self.near.reach + again.max(0.0)];
-            (ends, if again > 0.0 { [Pin::Goal, Pin::No] } else { [Pin::No, Pin::Goal] })
-        } else {
-            (hit_sphere(&self.near, center, leaf.radius)?, [Pin::No; 2])
-        };
-        let cosine = (ends[1] - ends[0]) / (2.0 * leaf.radius);
-        let (by, part) = ((leaf, SPHERE_ULP), Part::new(number, 0));
-        Some([
-            self.end(by, (ends[0], cosine), (part, pins[0]), true),
-            self.end(by, (ends[1], cosine), (part, pins[1]), false),
-        ])
-    }
-
-    /// Where the line enters and leaves a parallelepiped, and through which faces.
-    #[inline(always)]
-    fn meet_box(&self, number: u32, leaf: &LeafRecord) -> Option<[End; 2]> {
-        // The place, the cosine, the face.
-        let mut enter = (f64::NEG_INFINITY, 1.0, 0, Pin::No);
-        let mut leave = (f64::INFINITY, 1.0, 0, Pin::No);
-        for (face, &plane) in (0..).zip(&leaf.planes) {
-            let PlaneRecord { point, normal } = &self.view.planes[plane.index()];
-            let [point, normal] = [*point, *normal].map(DVec3::from_array);
-            let (distance, along) = toward_plane(&self.near, point, normal);
-            let (distance, along) = (plane.outward(distance), plane.outward(along));
-            if along == 0.0 {
-                if distance < 0.0 {
-                    return None; // Outside, and never nearer.
-                }
-                continue;
-            }
-            let surface = plane.surface();
-            let (t, pin) = if self.ray.leaving == surface {
-                (-self.start, Pin::Start)
-            } else if self.ending_on.contains(&surface) {
-                (self.near.reach, Pin::Goal)
-            } else {
-                (distance / along, Pin::No)
-            };
-            if along < 0.0 && t > enter.0 {
-                enter = (t, -along, face, pin);
-            } else if along > 0.0 && t < leave.0 {
-                leave = (t, along, face, pin);
-            }
-        }
-        if enter.0 >= leave.0 {
-            return None;
-        }
-        let end = |(t, cosine, face, pin), enters| {
-            self.end((leaf, PLANE_ULP), (t, cosine), (Part::new(number, face), pin), enters)
-        };
-        Some([end(enter, true), end(leave, false)])
-    }
-
-    /// The nearest common ancestor of two nodes, of which `a` comes first and is no ancestor of
-    /// `b`.
-    fn join(&self, a: u32, b: u32) -> u32 {
-        let mut node = a;
-        while node < b {
-            let SolidNodeRecord { jump, parent, .. } = self.nodes[node as usize];
-            node = if jump < b { jump } else { parent };
-        }
-        node
-    }
-
-    /// The crossing at an end.
-    fn crossing(&self, end: &End) -> Crossing {
-        let t = match end.pin {
-            Pin::No => self.start + end.t,
-            Pin::Start => 0.0,
-            Pin::Goal => self.ray.reach,
-        };
-        Crossing { t, part: end.part }
-    }
-}
 
 /// The stretches inside a part of the tree, in order: a run of [`Scratch::ends`].
 #[derive(Debug, Clone, Copy)]
@@ -255,6 +50,7 @@ pub(super) struct Scratch {
     ends: Vec<End>,
     /// How much of the ray was in doubt, all in all.
     doubted: f64,
+    walk: Walk,
 }
 
 impl Scratch {
@@ -273,45 +69,74 @@ impl Scratch {
         let course = Course::new(view, solid, ray, ending_on);
         let reach = reach - course.start;
         let margin = solid.margin;
-        let stretch = [-course.start - 2.0 * margin, reach + 2.0 * margin];
-        let box_ray = box_ray.in_frame(course.near.origin, stretch, &solid.frame);
         self.waiting.clear();
-        self.waiting.push((f32::NEG_INFINITY, Child::inner(solid.first_box as usize)));
         self.touched.clear();
+        let leaf_count = course.leaves.len();
+        let box_ray = if leaf_count > FEW_LEAVES {
+            self.waiting.push((f32::NEG_INFINITY, Child::inner(solid.first_box as usize)));
+            let stretch = [-course.start - 2.0 * margin, reach + 2.0 * margin];
+            Some(box_ray.in_frame(course.near.origin, stretch, &solid.frame))
+        } else {
+            self.touched.extend(0..leaf_count as u32);
+            None
+        };
+        let may_walk = course.nodes.len() <= SolidNodeRecord::BITS && ending_on.is_empty();
         // What comes up to here was told, or does not count.
         let mut told = -course.start - margin;
         let mut enough = FIRST_LOOK;
         loop {
-            let next = self.touch_leaves(view, kernel, &box_ray, enough);
+            let mut known = reach;
+            if let Some(box_ray) = &box_ray
+                && let Some(near) = self.touch_leaves(view, kernel, box_ray, enough)
+            {
+                known = (box_ray.distance(near) - 3.0 * margin).min(reach);
+            }
             if self.touched.is_empty() {
                 return;
             }
             if !self.touched.is_sorted() {
                 self.touched.sort_unstable();
             }
-            self.join_touched(&course);
-            let mut known =
-                next.map_or(reach, |near| box_ray.distance(near) - 3.0 * margin).min(reach);
-            if self.doubted > margin / 2.0 {
-                // What was passed over might be in one doubt with the rest.
-                self.touched.clear();
-                self.touched.extend(0..course.leaves.len() as u32);
-                self.waiting.clear();
-                self.join_touched(&course);
-                known = reach;
-            }
-            for end in self.ends.iter().filter(|end| told < end.t && end.t <= known) {
-                let crossing = course.crossing(end);
-                if crossing.t >= 0.0 && take(crossing) {
-                    return;
-                }
-            }
-            told = told.max(known);
-            if self.waiting.is_empty() {
+            let walked = if may_walk {
+                self.walk.tell(&course, &self.touched, (&mut told, known), &mut take)
+            } else {
+                Walked::Unsure
+            };
+            let has_enough = match walked {
+                Walked::Enough => true,
+                Walked::Through => false,
+                Walked::Unsure => self.join_and_tell(&course, told, (&mut known, reach), &mut take),
+            };
+            if has_enough || self.waiting.is_empty() {
                 return;
             }
+            told = told.max(known);
             enough *= 2;
         }
+    }
+
+    /// Joins the stretches inside the leaves that are touched, or inside all leaves where a doubt
+    /// might reach those that were passed over, and tells of the crossings after `told` and up to
+    /// `known`, which then is the reach; whether that is enough.
+    #[inline(never)]
+    fn join_and_tell(
+        &mut self,
+        course: &Course<'_>,
+        told: f64,
+        (known, reach): (&mut f64, f64),
+        take: &mut dyn FnMut(Crossing) -> bool,
+    ) -> bool {
+        self.join_touched(course);
+        if self.doubted > course.solid.margin / 2.0 {
+            self.touched.clear();
+            self.touched.extend(0..course.leaves.len() as u32);
+            self.waiting.clear();
+            self.join_touched(course);
+            *known = reach;
+        }
+        let ends = self.ends.iter().filter(|end| told < end.t && end.t <= *known);
+        let mut crossings = ends.map(|end| course.crossing(end)).filter(|it| it.t >= 0.0);
+        crossings.any(take)
     }
 
     /// Adds leaves that the ray touches, until there are `enough`; where the first of the others
@@ -613,6 +438,7 @@ fn long_step(step: &mut [End], enters: bool, wanted: impl Fn(&End) -> bool) -> E
 
 #[cfg(test)]
 mod tests {
+    use glam::DVec3;
     use rtfarm_oracle::{
         hard_case::{few_rays, random},
         random::Random,
