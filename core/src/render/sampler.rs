@@ -8,7 +8,7 @@ use super::{
     pixel::{Estimate, Neighbourhood, Pixel, Runs},
     settings::{Quality, Sampling},
     tally::Tally,
-    unseen::{FirstSamples, UnseenFaces, UnseenSearch},
+    unseen::{FirstSample, UnseenFaces, UnseenSearch},
     wavefront::{CameraSample, Wavefront},
 };
 use crate::{
@@ -84,7 +84,7 @@ impl<'a> Sampler<'a> {
             colors.push(color);
         })?;
         let (flat, seed) = (self.quality.flat, self.quality.seed);
-        let mut search = UnseenSearch::new(self.view, area.frame(), flat, error);
+        let mut search = UnseenSearch::new(self.view, area.frame(), flat, error, self.isa);
         let found = match &mut search {
             Some(search) => self.find_unseen(search, area, wide, &colors, &hits)?,
             None => Vec::new(),
@@ -161,19 +161,33 @@ impl<'a> Sampler<'a> {
         let mut found = Vec::new();
         for block in area.blocks(32) {
             (self.on_progress)()?;
-            let first_samples = |x: u32, y: u32| {
+            let first_sample = |x: u32, y: u32| {
                 let pixel = wide.index_of(x, y) as usize;
-                FirstSamples {
-                    hits: &hits[pixel..=pixel],
-                    samples: Samples::new(FEWEST_FOR_ERROR, seed, x, y),
-                    mean: colors[pixel],
-                }
+                let place = Samples::new(FEWEST_FOR_ERROR, seed, x, y).sample(0).place(x, y);
+                FirstSample { hit: hits[pixel], place, color: colors[pixel] }
             };
-            search.search(block, &first_samples, &mut |x, y, unseen| {
+            let is_calm = |x: u32, y: u32| {
+                let own = hits[wide.index_of(x, y) as usize];
+                let surface = |hit: &Hit| hit.face.surface(self.view);
+                own.is_some()
+                    && neighbours(wide, x, y)
+                        .map(|pixel| &hits[pixel as usize])
+                        .all(|hit| hit.rank == own.rank || surface(hit) == surface(&own))
+            };
+            search.search(block, &first_sample, &is_calm, &mut |x, y, unseen| {
                 found.push((area.index_of(x, y), unseen));
             });
         }
-        found.sort_unstable_by_key(|&(index, _)| index);
+        self.tally.rays += search.rays();
+        // In the order in which they were found, for sums round.
+        found.sort_by_key(|&(index, _)| index);
+        found.dedup_by(|(later, more), (index, unseen)| {
+            let is_same = later == index;
+            if is_same {
+                unseen.join(std::mem::take(more));
+            }
+            is_same
+        });
         ControlFlow::Continue(found)
     }
 

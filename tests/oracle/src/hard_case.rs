@@ -143,6 +143,8 @@ pub enum HardCase {
     CoincidentFaces = 66,
     /// An eye inside glass that mirrors too.
     InsideMirroringGlass = 67,
+    /// Wires in a shadow, in a mirror and behind panes.
+    ThinBeyond = 68,
     /// A solid far smaller than its scene.
     TinySolid = 69,
     /// A label on a tilted quadrangle, coplanar only within rounding.
