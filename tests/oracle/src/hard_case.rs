@@ -147,6 +147,8 @@ pub enum HardCase {
     ThinBeyond = 68,
     /// A solid far smaller than its scene.
     TinySolid = 69,
+    /// A checkerboard to the horizon, whose filter errs.
+    FilteredCheckerboard = 70,
     /// A label on a tilted quadrangle, coplanar only within rounding.
     LabelWithinRounding = 71,
     /// A solid of a thousand leaves, nested deep.
