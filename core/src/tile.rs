@@ -161,6 +161,24 @@ impl Area {
         Self { x0, y0, width, height, ..self }
     }
 
+    /// Whether it has the pixel (x, y) of the frame.
+    pub(crate) fn contains(self, x: u32, y: u32) -> bool {
+        self.columns().contains(&x) && self.rows().contains(&y)
+    }
+
+    /// The squares of `side` pixels, as the frame is cut into them, that have pixels of the area.
+    pub(crate) fn squares_of_frame(self, side: u32) -> impl Iterator<Item = Self> {
+        let (x0, y0) = (self.x0 / side * side, self.y0 / side * side);
+        let right = self.frame.width.min((self.x0 + self.width).next_multiple_of(side));
+        let bottom = self.frame.height.min((self.y0 + self.height).next_multiple_of(side));
+        Self { x0, y0, width: right - x0, height: bottom - y0, ..self }.blocks(side)
+    }
+
+    /// The pixels that it has in common with another area of the frame, row by row.
+    pub(crate) fn common_pixels(self, other: Self) -> impl Iterator<Item = (u32, u32)> {
+        self.pixels().filter(move |&(x, y)| other.contains(x, y))
+    }
+
     /// The area cut into squares of `side` pixels, row by row; those at the right and bottom edge
     /// may be narrower.
     pub(crate) fn blocks(self, side: u32) -> impl Iterator<Item = Self> {

@@ -152,6 +152,29 @@ impl Face {
         }
     }
 
+    /// A point of its plane and a unit normal, to either side, the same for all faces of a surface;
+    /// `None` where it is round.
+    pub(crate) fn plane(self, view: &View<'_>) -> Option<(DVec3, DVec3)> {
+        let of_plane = |plane: PlaneIndex| {
+            let record = &view.planes[plane.index()];
+            Some((DVec3::from_array(record.point), DVec3::from_array(record.normal)))
+        };
+        let index = self.item.index();
+        match self.item.kind()? {
+            Kind::Triangle => {
+                let point = self.polygon(view)?.corners()[0];
+                Some((point, self.normal(view, point)))
+            }
+            Kind::Coplanar => of_plane(view.coplanars[index].plane),
+            Kind::Quadrangle => of_plane(view.quadrangles[index].plane),
+            Kind::Sphere => None,
+            Kind::Solid => {
+                let leaf = self.part.leaf_of(view, &view.solids[index]);
+                if leaf.is_sphere() { None } else { of_plane(leaf.planes[self.part.face()]) }
+            }
+        }
+    }
+
     /// Whether it lies on a sphere.
     #[inline]
     pub(crate) fn is_round(self, view: &View<'_>) -> bool {

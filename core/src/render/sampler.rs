@@ -8,7 +8,7 @@ use super::{
     pixel::{Estimate, Neighbourhood, Pixel, Runs},
     settings::{Quality, Sampling},
     tally::Tally,
-    unseen::{FirstSamples, UnseenFaces, UnseenSearch},
+    unseen::{FirstSample, UnseenFaces, UnseenSearch},
     wavefront::{CameraSample, Wavefront},
 };
 use crate::{
@@ -21,6 +21,12 @@ use crate::{
 
 /// Camera rays in a batch: enough to fill the queues, few enough to stay in the cache.
 const BATCH: usize = 2048;
+
+/// The side of what an adaptive sample sees of a texture, as a share of the square that it stands for.
+/// What a filter takes from beyond the square is in all samples and no difference of theirs tells it,
+/// so adaptive pixels would stop at that. With half the side this error is a fourth, and some more noise
+/// is told.
+const SHARPENED: f64 = 0.5;
 
 /// Gives pixels their samples, a batch at a time.
 pub(super) struct Sampler<'a> {
@@ -84,7 +90,7 @@ impl<'a> Sampler<'a> {
             colors.push(color);
         })?;
         let (flat, seed) = (self.quality.flat, self.quality.seed);
-        let mut search = UnseenSearch::new(self.view, area.frame(), flat, error);
+        let mut search = UnseenSearch::new(self.view, area.frame(), flat, error, self.isa);
         let found = match &mut search {
             Some(search) => self.find_unseen(search, area, wide, &colors, &hits)?,
             None => Vec::new(),
@@ -161,19 +167,33 @@ impl<'a> Sampler<'a> {
         let mut found = Vec::new();
         for block in area.blocks(32) {
             (self.on_progress)()?;
-            let first_samples = |x: u32, y: u32| {
+            let first_sample = |x: u32, y: u32| {
                 let pixel = wide.index_of(x, y) as usize;
-                FirstSamples {
-                    hits: &hits[pixel..=pixel],
-                    samples: Samples::new(FEWEST_FOR_ERROR, seed, x, y),
-                    mean: colors[pixel],
-                }
+                let place = Samples::new(FEWEST_FOR_ERROR, seed, x, y).sample(0).place(x, y);
+                FirstSample { hit: hits[pixel], place, color: colors[pixel] }
             };
-            search.search(block, &first_samples, &mut |x, y, unseen| {
+            let is_calm = |x: u32, y: u32| {
+                let own = hits[wide.index_of(x, y) as usize];
+                let surface = |hit: &Hit| hit.face.surface(self.view);
+                own.is_some()
+                    && neighbours(wide, x, y)
+                        .map(|pixel| &hits[pixel as usize])
+                        .all(|hit| hit.rank == own.rank || surface(hit) == surface(&own))
+            };
+            search.search(block, &first_sample, &is_calm, &mut |x, y, unseen| {
                 found.push((area.index_of(x, y), unseen));
             });
         }
-        found.sort_unstable_by_key(|&(index, _)| index);
+        self.tally.rays += search.rays();
+        // In the order in which they were found, for sums round.
+        found.sort_by_key(|&(index, _)| index);
+        found.dedup_by(|(later, more), (index, unseen)| {
+            let is_same = later == index;
+            if is_same {
+                unseen.join(std::mem::take(more));
+            }
+            is_same
+        });
         ControlFlow::Continue(found)
     }
 
@@ -190,7 +210,10 @@ impl<'a> Sampler<'a> {
         mut add: impl FnMut(usize, DVec3),
     ) -> ControlFlow<()> {
         let seed = self.quality.seed;
-        let width = 1.0 / f64::from(count).sqrt();
+        let width = match self.quality.sampling {
+            Sampling::Fixed(_) => 1.0,
+            Sampling::Adaptive { .. } => SHARPENED,
+        } / f64::from(count).sqrt();
         let most_pixels = (BATCH / numbers.len()).max(1);
         for (batch, pixels) in chosen.chunks(most_pixels).enumerate() {
             for first in numbers.clone().step_by(BATCH) {

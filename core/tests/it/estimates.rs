@@ -11,7 +11,10 @@ use rtfarm_core::{
     render::{Quality, RenderedTile, Sampling, Settings, render_tile},
     tile::Size,
 };
-use rtfarm_oracle::known_pictures::{KnownPicture, known_pictures};
+use rtfarm_oracle::{
+    hard_case::{HardCase, few_rays},
+    known_pictures::{KnownPicture, checkerboard, known_pictures},
+};
 
 use crate::support::studio::{prepared, read, whole};
 
@@ -74,6 +77,33 @@ fn fixed_samples_tell_their_error() {
 #[test]
 fn adaptive_samples_tell_their_error() {
     check_calibration(&[16.0, 8.0, 4.0, 2.0, 1.0, 0.5].map(adaptive));
+}
+
+#[test]
+fn the_error_of_a_textures_filter_is_told_with_the_samples() {
+    let known = checkerboard(Size::new(48, 36).unwrap());
+    let scene = prepared(&known.scene);
+    let fixed = [8, 16, 64, 256].map(|count| Sampling::fixed(count).unwrap());
+    let all = fixed.into_iter().chain([16.0, 8.0, 4.0, 2.0, 1.0].map(adaptive));
+    let (mut least, mut most) = (f64::INFINITY, 0.0_f64);
+    for sampling in all {
+        for seed in 0..few_rays(2) as u64 {
+            let rendered = render(&scene, &known, sampling, seed);
+            let square = square_error(&rendered, &known);
+            let ratio = rendered.tally.error().unwrap() / square.sqrt();
+            let each = rendered.tally.samples as f64 / known.size.pixel_count() as f64;
+            eprintln!("{sampling}, {seed}: {:.1e}, told over true {ratio:.2}", square.sqrt());
+            (least, most) = (least.min(ratio), most.max(ratio));
+            if matches!(sampling, Sampling::Adaptive { .. }) && seed == 0 {
+                let fixed = fixed_samples_for(&known, square);
+                eprintln!("{each:.1} samples, fixed {fixed:.1}");
+                assert!(fixed > each, "{sampling}: {fixed} fixed for {each}");
+            }
+        }
+    }
+    HardCase::FilteredCheckerboard
+        .tell("the error that is told over the true one", format!("{least:.2} to {most:.2}"));
+    assert!(least >= 0.5 && most <= 2.0, "{least} .. {most}");
 }
 
 /// The samples that a fixed number in every pixel takes for that mean square error, between two

@@ -3,12 +3,15 @@
 
 use std::{fmt::Write, ops::ControlFlow};
 
+use glam::DVec3;
 use rtfarm_core::{
     isa::Isa,
     prepared::{PreparedBytes, PreparedScene},
     render::{Quality, RenderedTile, Sampling, render_tile},
     tile::{Area, Size},
 };
+
+use rtfarm_oracle::hard_case::HardCase;
 
 use crate::support::studio::{prepared, read, whole};
 
@@ -18,7 +21,8 @@ const PIXEL: f64 = 4.0 / 96.0;
 const VIEWPORT: &str = "viewport origin 0 0 5 topleft -2 1.5 0 bottomleft -2 -1.5 0
     topright 2 1.5 0 endviewport
     materials entry name white endentry entry name red color 255 0 0 endentry
-    entry name blue color 0 0 255 endentry entry name grey color 120 120 120 endentry endmaterials\n";
+    entry name blue color 0 0 255 endentry entry name grey color 120 120 120 endentry
+    entry name mirror color 0 0 0 reflect 1 endentry entry name pane alpha 0 endentry endmaterials\n";
 
 fn adaptive() -> Sampling {
     Sampling::adaptive(1.0 / 255.0, 256).unwrap()
@@ -32,11 +36,15 @@ fn scene(geometry: &str) -> PreparedScene<PreparedBytes> {
     prepared(&read(&format!("{VIEWPORT} geometry {geometry} endgeometry")))
 }
 
+fn scene_with(lights: &str, geometry: &str) -> PreparedScene<PreparedBytes> {
+    prepared(&read(&format!(
+        "{VIEWPORT} lights {lights} endlights geometry {geometry} endgeometry"
+    )))
+}
+
 /// In light that comes from everywhere faces look as they do without light, but nobody knows that.
 fn lit_scene(geometry: &str) -> PreparedScene<PreparedBytes> {
-    prepared(&read(&format!(
-        "{VIEWPORT} lights ambient 1 endlights geometry {geometry} endgeometry"
-    )))
+    scene_with("ambient 1", geometry)
 }
 
 fn render(
@@ -67,20 +75,29 @@ fn check(what: &str, scene: &PreparedScene<PreparedBytes>, channel: usize, truth
     assert!(adaptive.abs() < most, "{what}: {adaptive}");
 }
 
-/// A parallelogram at a depth of `z`: from (x, y) along (dx, dy), so wide across. It looks as it
-/// would at z = 0.
-fn wire([x, y]: [f64; 2], [dx, dy]: [f64; 2], width: f64, z: f64, material: &str) -> String {
+/// A parallelogram from (x, y) along (dx, dy), so wide across.
+fn wire_corners([x, y]: [f64; 2], [dx, dy]: [f64; 2], width: f64) -> [[f64; 2]; 4] {
     let length = (dx * dx + dy * dy).sqrt();
     let (nx, ny) = (-dy / length * width / 2.0, dx / length * width / 2.0);
-    let corners = [
-        (x - nx, y - ny),
-        (x + dx - nx, y + dy - ny),
-        (x + dx + nx, y + dy + ny),
-        (x + nx, y + ny),
-    ];
-    let scale = (5.0 - z) / 5.0;
+    [[x - nx, y - ny], [x + dx - nx, y + dy - ny], [x + dx + nx, y + dy + ny], [x + nx, y + ny]]
+}
+
+/// A wire at a depth of `z`. It looks as it would at z = 0.
+fn wire(from: [f64; 2], along: [f64; 2], width: f64, z: f64, material: &str) -> String {
+    mirrored_wire(from, along, width, (z, z), material)
+}
+
+/// A wire at a depth of `z` that looks as it would at z = 0 if it is seen at a depth of `seen`.
+fn mirrored_wire(
+    from: [f64; 2],
+    along: [f64; 2],
+    width: f64,
+    (seen, z): (f64, f64),
+    material: &str,
+) -> String {
+    let scale = (5.0 - seen) / 5.0;
     let mut text = "quadrangle ".to_owned();
-    for (x, y) in corners {
+    for [x, y] in wire_corners(from, along, width) {
         write!(text, "vertex {} {} {z} ", x * scale, y * scale).unwrap();
     }
     text + &format!("material {material} endquadrangle\n")
@@ -93,12 +110,17 @@ const MOST: [f64; 6] = [0.01, 0.01, 0.01, 0.02, 0.03, 0.05];
 
 /// Wires in a fan, so that they lie in all ways in their pixels: the text and the light of it.
 fn fan(width: f64, z: f64, material: &str) -> (String, f64) {
+    fan_at(width, (z, z), material)
+}
+
+/// Such a fan that is seen at one depth and is at another.
+fn fan_at(width: f64, depths: (f64, f64), material: &str) -> (String, f64) {
     let mut text = String::new();
     let mut light = 0.0;
     for k in 0..12 {
         let x = -1.8 + 0.2 * f64::from(k);
         let along = [0.01 * f64::from(k * k), 2.6];
-        text += &wire([x, -1.3], along, width * PIXEL, z, material);
+        text += &mirrored_wire([x, -1.3], along, width * PIXEL, depths, material);
         light += (along[0] * along[0] + along[1] * along[1]).sqrt() * width / PIXEL;
     }
     (text, light)
@@ -125,6 +147,130 @@ fn level_wires_are_in_the_adaptive_picture() {
         check(&format!("level wires of {width}"), &scene(&text), 0, light, most);
     }
 }
+
+/// Wires between a wall at z = -2 and a lamp that is so far that all of the wall is equally bright: each
+/// is its shadow, moved towards the lamp until the eye does not see it. The text and the area of the
+/// shadows in pixels.
+fn shading_fan(width: f64) -> (String, f64) {
+    let (mut text, mut area) = (String::new(), 0.0);
+    for k in 0..12 {
+        let (x, along) = (-1.8 + 0.2 * f64::from(k), [0.01 * f64::from(k * k), 2.6]);
+        text += "quadrangle ";
+        for [x, y] in wire_corners([x, -1.3], along, width * PIXEL) {
+            let on_wall = DVec3::new(1.4 * x, 1.4 * y, -2.0);
+            let DVec3 { x, y, z } = on_wall + 0.005 * (LAMP - on_wall);
+            write!(text, "vertex {x} {y} {z} ").unwrap();
+        }
+        text += "material red endquadrangle\n";
+        area += (along[0] * along[0] + along[1] * along[1]).sqrt() * width / PIXEL;
+    }
+    (text, area)
+}
+
+const LAMP: DVec3 = DVec3::new(2000.0, 300.0, 1000.0);
+
+#[test]
+fn shadows_of_wires_are_in_the_adaptive_picture() {
+    let lit = |geometry: &str| {
+        let distance = LAMP.length();
+        // The wall is as bright as what is white.
+        let power = 100.0 * distance / (LAMP.z + 2.0);
+        let lights = format!(
+            "reference power 100 distance {distance} endreference
+            point coords {} {} {} power {power} endpoint",
+            LAMP.x, LAMP.y, LAMP.z
+        );
+        scene_with(&lights, geometry)
+    };
+    let light = |scene: &PreparedScene<PreparedBytes>, sampling| {
+        let tile = render(scene, sampling, whole(frame()), Isa::fastest());
+        let light = tile.pixels.iter().map(|pixel| f64::from(pixel[0])).sum::<f64>();
+        (light, tile.tally.samples as f64 / frame().pixel_count() as f64)
+    };
+    let (bright, _) = light(&lit(WHITE_WALL), Sampling::fixed(1).unwrap());
+    let mut worst = 0.0_f64;
+    for width in WIDTHS {
+        let (text, area) = shading_fan(width);
+        let scene = lit(&(text + WHITE_WALL));
+        let lacking = |sampling: Sampling| {
+            let (dark, each) = light(&scene, sampling);
+            (1.0 - (bright - dark) / area, each)
+        };
+        let ((lack, each), (fixed, _)) =
+            (lacking(adaptive()), lacking(Sampling::fixed(64).unwrap()));
+        eprintln!(
+            "shadows of {width}: {lack:.3} lacks, with 64 samples {fixed:.3}; {each:.1} samples a pixel"
+        );
+        worst = worst.max(lack.abs());
+    }
+    check_beyond("shadows of wires of 1/2 to 1/64 pixel are in the adaptive picture", worst);
+}
+
+/// Tells how much is lacking at most of thin things that no beam from the eye meets, and that it is little.
+fn check_beyond(what: &str, lack: f64) {
+    HardCase::ThinBeyond.tell(what, format!("{:.1} % lacks at most", 100.0 * lack));
+    assert!(lack < 0.05, "{what}: {lack}");
+}
+
+/// The most that is lacking of wires of all widths that are seen at a depth and are at another.
+fn most_lacking(
+    what: &str,
+    depths: (f64, f64),
+    scene: impl Fn(&str) -> PreparedScene<PreparedBytes>,
+) -> f64 {
+    let of_width = |width| {
+        let (text, light) = fan_at(width, depths, "red");
+        let ([adaptive, fixed], each) = lacking(&scene(&text), 0, light);
+        eprintln!(
+            "{what}, of {width}: lacks {adaptive:.3}, with 64 samples {fixed:.3}; {each:.1} samples"
+        );
+        adaptive.abs()
+    };
+    WIDTHS.map(of_width).into_iter().fold(0.0, f64::max)
+}
+
+/// A square at z that the eye sees, or what is at z = -2 looks at.
+fn square(z: f64, material: &str) -> String {
+    format!(
+        "quadrangle vertex -40 -40 {z} vertex 40 -40 {z} vertex 40 40 {z} vertex -40 40 {z}
+        material {material} endquadrangle\n"
+    )
+}
+
+#[test]
+fn wires_in_a_mirror_are_in_the_adaptive_picture() {
+    // The eye has them behind it.
+    let depths = (-16.0, 12.0);
+    let mirror = square(-2.0, "mirror");
+    let plain = most_lacking("wires in a mirror", depths, |wires| scene(&(mirror.clone() + wires)));
+    let wall = mirror.clone() + &square(13.0, "blue");
+    let lines =
+        most_lacking("lines in a mirror", depths, |wires| lit_scene(&(wall.clone() + wires)));
+    // Seen in a mirror through a pane.
+    let pane = mirror + &square(1.0, "pane");
+    let both = most_lacking("wires behind both", depths, |wires| scene(&(pane.clone() + wires)));
+    check_beyond(
+        "wires of 1/2 to 1/64 pixel in a mirror are in the adaptive picture",
+        plain.max(lines).max(both),
+    );
+}
+
+#[test]
+fn wires_behind_panes_are_in_the_adaptive_picture() {
+    let mut worst = 0.0_f64;
+    for panes in [square(1.0, "pane"), square(1.0, "pane") + &square(0.5, "pane")] {
+        let wall = panes.clone() + &square(-2.0, "blue");
+        let depths = (-1.0, -1.0);
+        worst = worst
+            .max(most_lacking("wires", depths, |wires| scene(&(panes.clone() + wires))))
+            .max(most_lacking("lines", depths, |wires| lit_scene(&(wall.clone() + wires))));
+    }
+    check_beyond("wires of 1/2 to 1/64 pixel behind panes are in the adaptive picture", worst);
+}
+
+const WHITE_WALL: &str =
+    "quadrangle vertex -9 -9 -2 vertex 9 -9 -2 vertex 9 9 -2 vertex -9 9 -2 material white
+    endquadrangle ";
 
 const WALL: &str =
     "quadrangle vertex -9 -9 -2 vertex 9 -9 -2 vertex 9 9 -2 vertex -9 9 -2 material blue

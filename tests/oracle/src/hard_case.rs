@@ -143,8 +143,12 @@ pub enum HardCase {
     CoincidentFaces = 66,
     /// An eye inside glass that mirrors too.
     InsideMirroringGlass = 67,
+    /// Wires in a shadow, in a mirror and behind panes.
+    ThinBeyond = 68,
     /// A solid far smaller than its scene.
     TinySolid = 69,
+    /// A checkerboard to the horizon, whose filter errs.
+    FilteredCheckerboard = 70,
     /// A label on a tilted quadrangle, coplanar only within rounding.
     LabelWithinRounding = 71,
     /// A solid of a thousand leaves, nested deep.

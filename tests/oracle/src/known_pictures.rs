@@ -10,8 +10,8 @@ use rtfarm_core::{
 
 use crate::{
     closed_forms::{
-        Ellipse, bright_share, irradiance, patch_to_sphere, polygon_coverage, polygon_outline,
-        slab_screen_radius, sphere_outline,
+        Ellipse, irradiance, patch_to_sphere, polygon_coverage, polygon_outline,
+        slab_screen_radius, sphere_outline, wave_mean,
     },
     picture::{eye_direction, grid_positions},
 };
@@ -247,8 +247,10 @@ pub fn checkerboard(size: Size) -> KnownPicture {
             vertex -100000 -1 -100000 texcoord -100000 -100000
             material image endquadrangle endgeometry";
     let mut known = known_from("checkerboard", size, text, move |_, x, y| {
-        // In a row of the screen the depth is one, and the squares are clipped at once.
+        // In a row of the screen the depth is one, and the squares are clipped at once. Bilinear
+        // interpolation is one along a row of texels, times one across it.
         let lines = 4096;
+        let texel = 1.0 / 256.0;
         let line = |k: u32| {
             let down = f64::from(y) + (f64::from(k) + 0.5) / f64::from(lines);
             let height = 1.5 * down / f64::from(size.height()) - 0.5;
@@ -257,8 +259,8 @@ pub fn checkerboard(size: Size) -> KnownPicture {
             }
             let depth = 1.0 / height;
             let across = |x: u32| depth * (1.2 * f64::from(x) / f64::from(size.width()) - 0.6);
-            let starts_dark = -depth - (-depth).floor() < 0.5;
-            bright_share(across(x), across(x + 1), starts_dark)
+            let row = wave_mean(-depth - 1e-9, -depth + 1e-9, texel);
+            (1.0 - row * wave_mean(across(x), across(x + 1), texel)) / 2.0
         };
         (0..lines).map(line).sum::<f64>() / f64::from(lines)
     });

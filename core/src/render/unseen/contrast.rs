@@ -15,13 +15,24 @@ pub(super) struct Surfel {
     pub(super) normal: DVec3,
     /// Where it is, relative to the eye, in the block's units.
     pub(super) point: DVec3,
+    /// A pixel's side there.
+    pub(super) pixel_side: f64,
+    /// Which beam has met it; what it shows may continue only in the same.
+    pub(super) beam: u32,
 }
 
 impl Surfel {
-    /// Turns `normal` towards the eye.
-    pub(super) fn new(material: u32, normal: DVec3, point: DVec3) -> Self {
+    /// A piece at a place on the screen; `normal` is turned towards the eye.
+    pub(super) fn new(
+        screen: &Screen,
+        beam: u32,
+        material: u32,
+        normal: DVec3,
+        point: DVec3,
+    ) -> Self {
         let normal = if normal.dot(point) > 0.0 { -normal } else { normal };
-        Self { material, normal, point }
+        let pixel_side = screen.pixel_side() * screen.depth(point);
+        Self { material, normal, point, pixel_side, beam }
     }
 }
 
@@ -55,16 +66,15 @@ impl<'a> Contrasts<'a> {
 
     /// Bounds how far the colour of surfel `a` may lie from that of `b`, which it may continue;
     /// infinite where it does not.
-    pub(super) fn between(&self, screen: &Screen, a: &Surfel, b: &Surfel) -> DVec3 {
-        if a.material != b.material {
+    pub(super) fn between(&self, a: &Surfel, b: &Surfel) -> DVec3 {
+        if a.material != b.material || a.beam != b.beam {
             return DVec3::INFINITY;
         }
         let material = &self.materials[a.material as usize];
         if self.shows_plain(material) {
             return DVec3::ZERO;
         }
-        let pixel_side = screen.pixel_side() * screen.depth(a.point);
-        if b.normal.dot(a.point - b.point).abs() > pixel_side {
+        if b.normal.dot(a.point - b.point).abs() > a.pixel_side {
             return DVec3::INFINITY;
         }
         let Shares { own, other } = Shares::of(material);

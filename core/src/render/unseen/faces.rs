@@ -63,6 +63,16 @@ impl UnseenFaces {
             + self.uncounted_contrast * self.uncounted_contrast * (UNSEEN / (n * n * n))
     }
 
+    /// Takes in what else may hide in the pixel.
+    pub(in crate::render) fn join(&mut self, other: Self) {
+        let first = self.corners.len();
+        self.corners.extend(other.corners);
+        let moved =
+            other.faces.into_iter().map(|face| UnseenFace { first: face.first + first, ..face });
+        self.faces.extend(moved);
+        self.uncounted_contrast = self.uncounted_contrast.max(other.uncounted_contrast);
+    }
+
     /// Adds the fragment of a face with these corners, which lies between these rows.
     pub(super) fn add(
         &mut self,

@@ -6,9 +6,9 @@ use super::{
     contrast::{Contrasts, Surfel},
     faces::UnseenFaces,
     outline::{Clipper, Fragment, Outline, Outlines, contains},
-    screen::{Rectangle, Screen},
+    screen::{Reach, Rectangle, Screen},
 };
-use crate::{prepared::layout::View, sample::Samples, trace::ray::Hit};
+use crate::{prepared::layout::View, trace::ray::Hit};
 
 /// The share of a picture's error that one face may add unseen without being noted.
 const NEGLIGIBLE: f64 = 1.0 / 64.0;
@@ -16,14 +16,29 @@ const NEGLIGIBLE: f64 = 1.0 / 64.0;
 /// The share of a picture's error that all faces of a pixel may add unseen.
 const NEGLIGIBLE_SUM: f64 = 1.0 / 8.0;
 
-/// What a pixel's first samples saw.
-pub(in crate::render) struct FirstSamples<'a> {
-    /// What their camera rays met, one hit each.
-    pub(in crate::render) hits: &'a [Hit],
-    /// Where they lie in the pixel.
-    pub(in crate::render) samples: Samples,
-    /// The mean of what they saw.
-    pub(in crate::render) mean: DVec3,
+/// A pixel's first sample.
+#[derive(Debug, Clone, Copy)]
+pub(in crate::render) struct FirstSample {
+    /// What its ray met, as seen from where the beam comes from.
+    pub(in crate::render) hit: Hit,
+    /// Where it lies on the screen, in pixels.
+    pub(in crate::render) place: [f64; 2],
+    /// What it saw.
+    pub(in crate::render) color: DVec3,
+}
+
+/// A beam of a pixel, and what counts in it.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Sight<'a> {
+    /// The beam starts here.
+    pub(super) screen: &'a Screen,
+    /// Tells apart what beams meet.
+    pub(super) beam: u32,
+    pub(super) reach: Reach,
+    /// What is seen in it counts so much in the pixel, 0..=1.
+    pub(super) weight: f64,
+    /// Faces that begin at a larger depth do not count.
+    pub(super) deepest: f64,
 }
 
 /// Judges faces in the beam of one pixel after another.
@@ -35,10 +50,6 @@ pub(super) struct Judge<'a> {
     clipper: Clipper,
     /// The indices of the outlines that the pixel's samples did not meet.
     suspects: Vec<usize>,
-    /// Where the pixel's first samples lie on the screen.
-    places: Vec<[f64; 2]>,
-    /// What they saw.
-    seen: Vec<Surfel>,
 }
 
 impl<'a> Judge<'a> {
@@ -49,19 +60,16 @@ impl<'a> Judge<'a> {
             error,
             clipper: Clipper::default(),
             suspects: Vec::new(),
-            places: Vec::new(),
-            seen: Vec::new(),
         }
     }
 
     /// Finds what a pixel may hide up to a depth, among the outlines of its block.
     pub(super) fn find_unseen(
         &mut self,
-        screen: &Screen,
+        sight: &Sight<'_>,
         outlines: &Outlines,
         (x, y): (u32, u32),
-        first: &FirstSamples<'_>,
-        deepest: f64,
+        first: &FirstSample,
     ) -> UnseenFaces {
         let pixel = Rectangle::of_pixel(x, y);
         let mut unseen = UnseenFaces::default();
@@ -69,85 +77,152 @@ impl<'a> Judge<'a> {
         suspects.clear();
         suspects.extend((0..outlines.as_slice().len()).filter(|&index| {
             let outline = &outlines.as_slice()[index];
-            outline.nearest <= deepest
+            outline.nearest <= sight.deepest
                 && outline.bounds.overlaps(&pixel)
-                && first.hits.iter().all(|hit| hit.rank != outline.rank)
+                && first.hit.rank != outline.rank
         }));
         if !suspects.is_empty() {
             suspects.sort_unstable_by_key(|&index| outlines.as_slice()[index].rank);
-            self.note_seen(screen, first, (x, y));
+            let seen = self.seen(sight, first);
             for &index in &suspects {
                 let outline = &outlines.as_slice()[index];
-                self.judge(screen, outlines, outline, &pixel, first, &mut unseen);
+                self.judge(sight, (outlines, outline), &pixel, (first, seen.as_ref()), &mut unseen);
             }
-            self.drop_negligible(&mut unseen, first.hits.len() as u32);
+            self.drop_negligible(&mut unseen, 1);
         }
         self.suspects = suspects;
         unseen
     }
 
-    /// Notes where a pixel's first samples lie and what they saw, each face once.
-    fn note_seen(&mut self, screen: &Screen, first: &FirstSamples<'_>, (x, y): (u32, u32)) {
-        self.places.clear();
-        self.seen.clear();
-        for (number, hit) in (0..).zip(first.hits) {
-            let place = first.samples.sample(number).place(x, y);
-            self.places.push(place);
-            let earlier = &first.hits[..number as usize];
-            if !hit.is_some() || earlier.iter().any(|earlier| earlier.rank == hit.rank) {
-                continue;
-            }
-            let direction = screen.direction(place);
+    /// What a pixel's first sample saw.
+    fn seen(&self, sight: &Sight<'_>, first: &FirstSample) -> Option<Surfel> {
+        first.hit.is_some().then(|| {
+            let (screen, hit) = (sight.screen, &first.hit);
+            let direction = screen.direction(first.place);
             let point = direction * (hit.t / direction.length());
             let normal = hit.face.normal(self.view, screen.eye() + point);
-            self.seen.push(Surfel::new(hit.face.material_index(self.view), normal, point));
-        }
+            let material = hit.face.material_index(self.view);
+            Surfel::new(screen, sight.beam, material, normal, point)
+        })
     }
 
     /// Adds a face to what a pixel may hide, unless it shows nothing new there, is hidden or has
     /// been passed by a sample.
     fn judge(
         &mut self,
-        screen: &Screen,
-        outlines: &Outlines,
-        outline: &Outline,
+        sight: &Sight<'_>,
+        (outlines, outline): (&Outlines, &Outline),
         pixel: &Rectangle,
-        first: &FirstSamples<'_>,
+        (first, seen): (&FirstSample, Option<&Surfel>),
         unseen: &mut UnseenFaces,
     ) {
         let material = outline.face.material_index(self.view);
-        let mut contrast = self.contrasts.with_mean(material, first.mean);
+        let mut contrast = self.contrast(sight, material, first.color);
         if self.is_negligible(outline.bounds.common_area(pixel), contrast) {
             return;
         }
         let corners = outlines.corners_of(outline);
-        let Some(fragment) = Fragment::new(corners, &outline.bounds, pixel, &mut self.clipper)
+        let Some(fragment) =
+            Fragment::new(corners, &outline.bounds, pixel, &sight.reach, &mut self.clipper)
         else {
             return;
         };
         if self.is_negligible(fragment.share, contrast) {
             return;
         }
+        let screen = sight.screen;
         // Beyond an edge of what is seen a face may begin, but not more than a pixel behind it.
         let nearest = screen.point(fragment.nearest);
         let pixel_side = screen.pixel_side() / fragment.nearest[2];
         let is_behind = |seen: &Surfel| seen.normal.dot(nearest - seen.point) < -pixel_side;
-        if first.hits.iter().all(Hit::is_some) && self.seen.iter().all(is_behind) {
+        if seen.is_some_and(is_behind) {
             return;
         }
         let point = screen.point(fragment.middle);
-        let surfel = Surfel::new(material, self.normal(outline, point), point);
-        for seen in &self.seen {
-            contrast = contrast.min(self.contrasts.between(screen, &surfel, seen));
+        let normal = self.normal(outline, point);
+        let surfel = Surfel::new(screen, sight.beam, material, normal, point);
+        if let Some(seen) = seen {
+            contrast = contrast.min(sight.weight * self.contrasts.between(&surfel, seen));
         }
         if self.is_negligible(fragment.share, contrast) {
             return;
         }
-        if self.places.iter().any(|&place| contains(self.clipper.polygon(), place)) {
+        if contains(self.clipper.polygon(), first.place) {
             return;
         }
         let rows = [outline.bounds.low[1], outline.bounds.high[1]];
         unseen.add(&fragment, self.clipper.polygon(), rows, contrast, surfel);
+    }
+
+    /// How far the colour of a face may change that of the pixel, whose first samples saw `mean`.
+    fn contrast(&self, sight: &Sight<'_>, material: u32, mean: DVec3) -> DVec3 {
+        if sight.weight == 1.0 {
+            return self.contrasts.with_mean(material, mean);
+        }
+        // The rest of the pixel hides how much of that mean was seen there.
+        let most = self.contrasts.with_mean(material, mean / sight.weight);
+        sight.weight * most.max(self.contrasts.with_mean(material, DVec3::ZERO))
+    }
+
+    /// Finds the faces in a beam between a pixel and a light whose shadows no sample may have met.
+    /// `light` is what of its first sample, at `place`, may be this light's.
+    pub(super) fn find_shadows(
+        &mut self,
+        sight: &Sight<'_>,
+        outlines: &Outlines,
+        (x, y): (u32, u32),
+        (place, light): ([f64; 2], DVec3),
+        is_ignored: impl Fn(&Outline) -> bool,
+    ) -> UnseenFaces {
+        let pixel = Rectangle::of_pixel(x, y);
+        let mut unseen = UnseenFaces::default();
+        let mut suspects = std::mem::take(&mut self.suspects);
+        suspects.clear();
+        suspects.extend((0..outlines.as_slice().len()).filter(|&index| {
+            let outline = &outlines.as_slice()[index];
+            outline.nearest <= sight.deepest
+                && outline.bounds.overlaps(&pixel)
+                && !is_ignored(outline)
+        }));
+        suspects.sort_unstable_by_key(|&index| outlines.as_slice()[index].rank);
+        let share_kept = |outline: &Outline| outline.face.material(self.view).transmittance();
+        // What lies in the way of the sample itself.
+        let mut light = light;
+        let mut clipper = std::mem::take(&mut self.clipper);
+        let cut = |outline: &Outline, clipper: &mut Clipper| {
+            let corners = outlines.corners_of(outline);
+            Fragment::new(corners, &outline.bounds, &pixel, &sight.reach, clipper)
+        };
+        suspects.retain(|&index| {
+            let outline = &outlines.as_slice()[index];
+            let is_passed = contains(outlines.corners_of(outline), place)
+                && cut(outline, &mut clipper).is_some()
+                && contains(clipper.polygon(), place);
+            if is_passed {
+                light *= share_kept(outline);
+            }
+            !is_passed
+        });
+        for &index in &suspects {
+            let outline = &outlines.as_slice()[index];
+            let contrast = (1.0 - share_kept(outline)) * light;
+            if self.is_negligible(outline.bounds.common_area(&pixel), contrast) {
+                continue;
+            }
+            let Some(fragment) = cut(outline, &mut clipper) else { continue };
+            if !self.is_negligible(fragment.share, contrast) {
+                let point = sight.screen.point(fragment.middle);
+                let normal = self.normal(outline, point);
+                let material = outline.face.material_index(self.view);
+                let surfel = Surfel::new(sight.screen, sight.beam, material, normal, point);
+                let rows = [outline.bounds.low[1], outline.bounds.high[1]];
+                unseen.add(&fragment, clipper.polygon(), rows, contrast, surfel);
+            }
+        }
+        self.clipper = clipper;
+        self.suspects = suspects;
+        self.drop_negligible(&mut unseen, 1);
+        unseen
     }
 
     /// The unit normal of a face, to either side, where it is small or flat: a sphere that is so
@@ -161,7 +236,7 @@ impl<'a> Judge<'a> {
     }
 
     /// Whether a face that covers this share of the pixel adds so little that it is not noted.
-    fn is_negligible(&self, share: f64, contrast: DVec3) -> bool {
+    pub(super) fn is_negligible(&self, share: f64, contrast: DVec3) -> bool {
         share * contrast.max_element() < NEGLIGIBLE * self.error
     }
 
@@ -170,14 +245,13 @@ impl<'a> Judge<'a> {
     /// pixel has `count` samples now.
     pub(super) fn note_samples(
         &self,
-        screen: &Screen,
         unseen: &mut UnseenFaces,
         places: impl Iterator<Item = [f64; 2]>,
         count: u32,
     ) {
         for place in places {
             while let Some(passed) = unseen.remove_at(place) {
-                unseen.limit_contrasts(|face| self.contrasts.between(screen, face, &passed));
+                unseen.limit_contrasts(|face| self.contrasts.between(face, &passed));
             }
         }
         self.drop_negligible(unseen, count);

@@ -8,24 +8,30 @@
 //! has met or passed, and whose colour may lie far enough from what was seen ([`contrast`]). They
 //! are the pixel's [`UnseenFaces`], and tell how much its mean may lack; later samples take them
 //! out one by one.
+//!
+//! The same search goes on from flat surfaces ([`onward`]): towards the lights, for shadows, into
+//! mirrors and through what does not bend.
 
 mod contrast;
 mod faces;
 mod frustum;
 mod judge;
+mod onward;
 mod outline;
 mod screen;
 
-pub(super) use self::{faces::UnseenFaces, judge::FirstSamples};
+pub(super) use self::{faces::UnseenFaces, judge::FirstSample};
 
 use glam::DVec3;
 
 use self::{
     frustum::FrustumSearch,
-    judge::Judge,
-    screen::{Beam, Rectangle, Screen},
+    judge::{Judge, Sight},
+    onward::{OnwardSearch, Tools},
+    screen::{Beam, Reach, Rectangle, Screen},
 };
 use crate::{
+    isa::Isa,
     prepared::layout::View,
     tile::{Area, Size},
     trace::ray::Hit,
@@ -52,53 +58,75 @@ pub(super) struct UnseenSearch<'a> {
     screen: Screen,
     frustum_search: FrustumSearch,
     judge: Judge<'a>,
+    /// It is `None` where no surface sends beams on.
+    onward: Option<OnwardSearch<'a>>,
 }
 
 impl<'a> UnseenSearch<'a> {
     /// Prepares the search in a picture with the standard error `error`, above 0, that shows plain
     /// colours if it is `flat`. It is `None` where the screen is seen edge-on, so that a pixel has
     /// no beam.
-    pub(super) fn new(view: &'a View<'a>, size: Size, flat: bool, error: f64) -> Option<Self> {
+    pub(super) fn new(
+        view: &'a View<'a>,
+        size: Size,
+        flat: bool,
+        error: f64,
+        isa: Isa,
+    ) -> Option<Self> {
         let screen = Screen::new(&view.header.camera, size)?;
         let judge = Judge::new(view, flat, error);
-        Some(Self { view, screen, frustum_search: FrustumSearch::default(), judge })
+        let frustum_search = FrustumSearch::default();
+        let onward = OnwardSearch::new(view, flat, isa);
+        Some(Self { view, screen, frustum_search, judge, onward })
     }
 
-    /// Finds what may hide in the pixels of an area. `first_samples` tells what a pixel's samples
-    /// saw, and `on_found` gets each pixel that may hide something.
-    pub(super) fn search<'s>(
+    /// The rays that the search has traced.
+    pub(super) fn rays(&self) -> u64 {
+        self.onward.as_ref().map_or(0, OnwardSearch::rays)
+    }
+
+    /// Finds what may hide in the pixels of an area. `first_sample` tells what a pixel's first
+    /// sample saw, `is_calm` whether those around it met the same surface, and `on_found` gets each pixel that may hide something.
+    pub(super) fn search(
         &mut self,
         area: Area,
-        first_samples: &impl Fn(u32, u32) -> FirstSamples<'s>,
+        first_sample: &impl Fn(u32, u32) -> FirstSample,
+        is_calm: &impl Fn(u32, u32) -> bool,
         on_found: &mut impl FnMut(u32, u32, UnseenFaces),
     ) {
-        self.search_blocks(area, &BLOCKS, first_samples, on_found);
+        self.search_blocks(area, &BLOCKS, first_sample, on_found);
+        if let Some(onward) = &mut self.onward {
+            let looks = |x, y| is_calm(x, y).then(|| first_sample(x, y));
+            let (frustum_search, judge) = (&mut self.frustum_search, &mut self.judge);
+            let tools = Tools { frustum_search, judge, on_found };
+            onward.search(&self.screen, area, tools, &looks);
+        }
     }
 
-    fn search_blocks<'s>(
+    fn search_blocks(
         &mut self,
         area: Area,
         sizes: &[(u32, usize)],
-        first_samples: &impl Fn(u32, u32) -> FirstSamples<'s>,
+        first_sample: &impl Fn(u32, u32) -> FirstSample,
         on_found: &mut impl FnMut(u32, u32, UnseenFaces),
     ) {
         let Some((&(side, most), smaller)) = sizes.split_first() else {
             let (x, y) = (area.x0(), area.y0());
-            return self.search_crowded(x, y, &first_samples(x, y), on_found);
+            return self.search_crowded(x, y, &first_sample(x, y), on_found);
         };
         for block in area.blocks(side) {
             let deepest = block
                 .pixels()
-                .map(|(x, y)| self.deepest(x, y, first_samples(x, y).hits))
+                .map(|(x, y)| self.deepest(x, y, &first_sample(x, y).hit))
                 .fold(0.0, f64::max);
             let beam = Beam { block: Rectangle::of_block(block), deepest };
             if !self.frustum_search.collect(self.view, &self.screen, &beam, most) {
-                self.search_blocks(block, smaller, first_samples, on_found);
+                self.search_blocks(block, smaller, first_sample, on_found);
                 continue;
             }
             for (x, y) in block.pixels() {
-                let first = first_samples(x, y);
-                let unseen = self.find_unseen(x, y, &first, self.deepest(x, y, first.hits));
+                let first = first_sample(x, y);
+                let unseen = self.find_unseen(x, y, &first, self.deepest(x, y, &first.hit));
                 if !unseen.is_empty() {
                     on_found(x, y, unseen);
                 }
@@ -112,18 +140,17 @@ impl<'a> UnseenSearch<'a> {
         &mut self,
         x: u32,
         y: u32,
-        first: &FirstSamples<'_>,
+        first: &FirstSample,
         on_found: &mut impl FnMut(u32, u32, UnseenFaces),
     ) {
-        let nearest = first.hits.iter().map(|hit| hit.t).fold(f64::INFINITY, f64::min);
         let middle = self.screen.pixel_direction(x, y).length();
         let clearance = 1.0 - CROWDED_CLEARANCE * self.screen.pixel_side() / middle;
-        let deepest = nearest / middle * clearance;
+        let deepest = first.hit.t / middle * clearance;
         let beam = Beam { block: Rectangle::of_pixel(x, y), deepest };
         let unseen = if self.frustum_search.collect(self.view, &self.screen, &beam, MOST_FACES) {
             self.find_unseen(x, y, first, deepest)
         } else {
-            UnseenFaces::uncounted(first.mean.max(DVec3::ONE - first.mean))
+            UnseenFaces::uncounted(first.color.max(DVec3::ONE - first.color))
         };
         if !unseen.is_empty() {
             on_found(x, y, unseen);
@@ -131,20 +158,14 @@ impl<'a> UnseenSearch<'a> {
     }
 
     /// The depth up to which faces count in a pixel.
-    fn deepest(&self, x: u32, y: u32, hits: &[Hit]) -> f64 {
-        let farthest = hits.iter().map(|hit| hit.t).fold(0.0, f64::max);
-        DEPTH_RATIO * farthest / self.screen.pixel_direction(x, y).length()
+    fn deepest(&self, x: u32, y: u32, hit: &Hit) -> f64 {
+        DEPTH_RATIO * hit.t / self.screen.pixel_direction(x, y).length()
     }
 
-    fn find_unseen(
-        &mut self,
-        x: u32,
-        y: u32,
-        first: &FirstSamples<'_>,
-        deepest: f64,
-    ) -> UnseenFaces {
-        let outlines = &self.frustum_search.outlines;
-        self.judge.find_unseen(&self.screen, outlines, (x, y), first, deepest)
+    fn find_unseen(&mut self, x: u32, y: u32, first: &FirstSample, deepest: f64) -> UnseenFaces {
+        let screen = &self.screen;
+        let sight = Sight { screen, beam: 0, reach: Reach::Whole, weight: 1.0, deepest };
+        self.judge.find_unseen(&sight, &self.frustum_search.outlines, (x, y), first)
     }
 
     /// Takes out of what a pixel may hide what its next samples, at these places in pixels on the
@@ -155,7 +176,7 @@ impl<'a> UnseenSearch<'a> {
         places: impl Iterator<Item = [f64; 2]>,
         count: u32,
     ) {
-        self.judge.note_samples(&self.screen, unseen, places, count);
+        self.judge.note_samples(unseen, places, count);
     }
 }
 
@@ -273,7 +294,8 @@ mod tests {
             let shares = frame.pixels().filter_map(|(x, y)| {
                 let pixel = Rectangle::of_pixel(x, y);
                 let overlaps = face.bounds.overlaps(&pixel);
-                let cut = || Fragment::new(corners, &face.bounds, &pixel, &mut clipper);
+                let cut =
+                    || Fragment::new(corners, &face.bounds, &pixel, &Reach::Whole, &mut clipper);
                 overlaps.then(cut)?.map(|fragment| fragment.share)
             });
             let sum: f64 = shares.sum();

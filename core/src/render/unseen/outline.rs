@@ -4,7 +4,7 @@ use std::f64::consts::FRAC_1_SQRT_2;
 
 use glam::DVec3;
 
-use super::screen::{Beam, Rectangle, Screen};
+use super::screen::{Beam, Reach, Rectangle, Screen};
 use crate::{
     exact::clip::clip,
     prepared::{
@@ -213,12 +213,13 @@ pub(super) struct Fragment {
 }
 
 impl Fragment {
-    /// Cuts the outline with these corners and bounds to a pixel; the fragment's own corners are
+    /// Cuts the outline with these corners and bounds to a pixel and to what is within reach; the fragment's own corners are
     /// left in `clipper`. It is `None` where nothing is left.
     pub(super) fn new(
         corners: &[Corner],
         bounds: &Rectangle,
         pixel: &Rectangle,
+        reach: &Reach,
         clipper: &mut Clipper,
     ) -> Option<Self> {
         let ([x0, y0], [x1, y1]) = (pixel.low, pixel.high);
@@ -234,6 +235,9 @@ impl Fragment {
         }
         if bounds.high[1] > y1 {
             clipper.clip(|corner| y1 - corner[1]);
+        }
+        if !matches!(reach, Reach::Whole) {
+            clipper.clip(|corner| reach.height(corner));
         }
         let polygon = clipper.polygon();
         let mut twice_area = 0.0;

@@ -27,15 +27,32 @@ impl Screen {
         let top_left = DVec3::from_array(camera.top_left);
         let right = DVec3::from_array(camera.right) / f64::from(size.width());
         let down = DVec3::from_array(camera.down) / f64::from(size.height());
+        Self::with_axes(DVec3::from_array(camera.eye), [top_left, right, down])
+    }
+
+    fn with_axes(eye: DVec3, axes: [DVec3; 3]) -> Option<Self> {
+        let [top_left, right, down] = axes;
         let volume = top_left.dot(right.cross(down));
         let inverse_rows = [right.cross(down), down.cross(top_left), top_left.cross(right)]
             .map(|row| row / volume);
-        inverse_rows.iter().all(|row| row.is_finite()).then(|| Self {
-            eye: DVec3::from_array(camera.eye),
-            axes: [top_left, right, down],
-            inverse_rows,
-            pixel_side: right.length().max(down.length()),
-        })
+        let pixel_side = right.length().max(down.length());
+        let is_finite = inverse_rows.iter().all(|row| row.is_finite());
+        is_finite.then_some(Self { eye, axes, inverse_rows, pixel_side })
+    }
+
+    /// The same pixels of a flat surface as a light at `position` sees them: places and the surface's
+    /// depths are those on this screen.
+    pub(super) fn from_light(&self, sheet: &Sheet, position: DVec3) -> Option<Self> {
+        let away = self.eye - position;
+        let axes = [0, 1, 2].map(|k| self.axes[k] + sheet.inverse_depth[k] * away);
+        Self::with_axes(position, axes)
+    }
+
+    /// What is seen in a flat surface as if it were a window.
+    pub(super) fn mirrored(&self, sheet: &Sheet) -> Option<Self> {
+        let normal = sheet.normal;
+        let eye = self.eye + 2.0 * sheet.distance * normal;
+        Self::with_axes(eye, self.axes.map(|axis| axis - 2.0 * normal.dot(axis) * normal))
     }
 
     /// The eye, in the block's coordinates.
@@ -71,6 +88,65 @@ impl Screen {
     /// A pixel's longer side at depth 1, in the block's units; at another depth it grows with it.
     pub(super) fn pixel_side(&self) -> f64 {
         self.pixel_side
+    }
+}
+
+/// A flat surface as a screen sees it.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Sheet {
+    /// Its unit normal, to either side.
+    pub(super) normal: DVec3,
+    /// How far it is from the origin of the block's coordinates along `normal`, and from the eye.
+    height: f64,
+    distance: f64,
+    /// Its inverse depth at the frame's top left corner, and how that grows with a pixel to the
+    /// right and one down.
+    inverse_depth: [f64; 3],
+}
+
+/// Faces begin this share of their depth before or behind a surface.
+const CLEARANCE: f64 = 1e-9;
+
+impl Sheet {
+    /// The plane through a point; `None` where the eye is in it.
+    pub(super) fn new(screen: &Screen, point: DVec3, normal: DVec3) -> Option<Self> {
+        let (height, distance) = (normal.dot(point), normal.dot(point - screen.eye));
+        let inverse_depth = screen.axes.map(|axis| normal.dot(axis) / distance);
+        let is_finite = inverse_depth.iter().all(|depth| depth.is_finite());
+        is_finite.then_some(Self { normal, height, distance, inverse_depth })
+    }
+
+    /// Its inverse depth at a place on the screen.
+    pub(super) fn inverse_depth(&self, [x, y]: [f64; 2]) -> f64 {
+        let [corner, across, down] = self.inverse_depth;
+        corner + x * across + y * down
+    }
+
+    /// Whether a point is on the side that the eye sees.
+    pub(super) fn is_before(&self, point: DVec3) -> bool {
+        (self.height - self.normal.dot(point)) * self.distance > 0.0
+    }
+}
+
+/// Which faces in a beam count.
+#[derive(Debug, Clone, Copy)]
+pub(super) enum Reach {
+    /// All of them.
+    Whole,
+    /// What of them is before a surface.
+    Before(Sheet),
+    /// What of them is behind one.
+    Behind(Sheet),
+}
+
+impl Reach {
+    /// How far within reach a corner on the screen is; below 0 it is not.
+    pub(super) fn height(&self, [x, y, inverse_depth]: [f64; 3]) -> f64 {
+        match self {
+            Self::Whole => 0.0,
+            Self::Before(sheet) => inverse_depth - sheet.inverse_depth([x, y]) * (1.0 + CLEARANCE),
+            Self::Behind(sheet) => sheet.inverse_depth([x, y]) * (1.0 - CLEARANCE) - inverse_depth,
+        }
     }
 }
 
@@ -127,4 +203,16 @@ pub(super) struct Beam {
     pub(super) block: Rectangle,
     /// Faces that begin at a larger depth do not count.
     pub(super) deepest: f64,
+}
+
+impl Beam {
+    /// A beam up to a surface.
+    pub(super) fn before(sheet: &Sheet, block: Rectangle) -> Self {
+        let Rectangle { low: [x0, y0], high: [x1, y1] } = block;
+        let least = [[x0, y0], [x0, y1], [x1, y0], [x1, y1]]
+            .map(|corner| sheet.inverse_depth(corner))
+            .into_iter()
+            .fold(f64::INFINITY, f64::min);
+        Self { block, deepest: if least > 0.0 { 1.0 / least } else { f64::INFINITY } }
+    }
 }

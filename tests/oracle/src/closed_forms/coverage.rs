@@ -222,13 +222,22 @@ pub fn area(outline: &[DVec2]) -> f64 {
     rest.windows(2).map(|pair| (pair[0] - first).perp_dot(pair[1] - first)).sum::<f64>() / 2.0
 }
 
-/// The share of a checkerboard's bright squares, of half a unit, between two coordinates along a
-/// row of them that starts dark or bright at 0.
-pub fn bright_share(from: f64, to: f64, starts_dark: bool) -> f64 {
-    // Bright where the fraction is 0.5 or more.
-    let up_to = |x: f64| x.floor() * 0.5 + (x - x.floor() - 0.5).max(0.0);
-    let share = (up_to(to) - up_to(from)) / (to - from);
-    if starts_dark { share } else { 1.0 - share }
+/// The mean between two coordinates of a wave that is 1 from 0 to 1/2, -1 from there to 1, and so on, but
+/// for edges that slope over `slope` units, at most 1/2: what interpolation makes of a row of texels.
+pub fn wave_mean(from: f64, to: f64, slope: f64) -> f64 {
+    let half = slope / 2.0;
+    let up_to = |x: f64| {
+        // The wave is as far above 0 before 1/2 as it is below after it.
+        let part = x - x.floor();
+        let part = part.min(1.0 - part);
+        if part < half {
+            part * part / slope
+        } else {
+            let beyond = (part - (0.5 - half)).max(0.0);
+            part - half / 2.0 - beyond * beyond / slope
+        }
+    };
+    (up_to(to) - up_to(from)) / (to - from)
 }
 
 fn pixel_corners(x: u32, y: u32) -> [DVec2; 4] {

@@ -7,7 +7,7 @@ mod light;
 mod refraction;
 
 pub use coverage::{
-    Ellipse, area, bright_share, clip_to_pixel, polygon_coverage, polygon_outline, sphere_outline,
+    Ellipse, area, clip_to_pixel, polygon_coverage, polygon_outline, sphere_outline, wave_mean,
 };
 pub use light::{
     integrating_sphere_bounce, irradiance, one_bounce_from_disc, patch_to_polygon, patch_to_sphere,
