@@ -987,6 +987,9 @@ fn run_until(is_enough: impl Fn(&Totals, u64) -> bool + Sync) -> Totals {
             if is_enough(totals, *seeds) {
                 return;
             }
+            if *seeds % 1000 == 0 {
+                eprintln!("{seeds} seeds, {} faults", totals.fault_count());
+            }
             *seeds += 1;
             *seeds - 1
         };

@@ -420,6 +420,28 @@ fn tiles_of_a_liar_that_are_being_stored_are_taken_back_too() {
 }
 
 #[test]
+fn a_copy_of_a_tile_that_is_taken_back_while_it_is_stored_is_rejected() {
+    let mut world = World::with_audit(1e-9);
+    let [liar, second, third] = [world.join(), world.join(), world.join()];
+    world.submit(2);
+    let run = world.lease(liar);
+    world.deliver(liar, &run, 9);
+    world.store(&run);
+    let late = world.lease(liar);
+    let again = world.lease(second);
+    world.deliver(second, &again, 7);
+    world.now += SECOND;
+    let copy = world.lease(second);
+    assert_eq!(copy.tiles, late.tiles, "it is overdue");
+    let (id, _) = world.deliver(liar, &late, 9);
+    let (copy_id, _) = world.deliver(second, &copy, 7);
+    let again = world.lease(third);
+    world.deliver(third, &again, 7);
+    let actions = world.store(&late);
+    assert_eq!(verdicts(&actions), [(id, Verdict::Accepted), (copy_id, Verdict::Rejected)]);
+}
+
+#[test]
 fn a_tile_of_which_nobody_knows_who_is_right_fails_its_job_at_the_end() {
     for third_says in [None, Some(8)] {
         let mut world = World::with_audit(1e-9);
