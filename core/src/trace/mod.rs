@@ -7,6 +7,8 @@ mod boxes;
 mod boxes_x86;
 mod hit;
 mod kernels;
+mod lanes;
+mod packet;
 pub(crate) mod probe;
 pub(crate) mod quadrangle;
 pub(crate) mod ray;
