@@ -67,9 +67,11 @@ impl<'a> Sampler<'a> {
 
     /// The pixels of `area` with `count` samples each.
     fn sample_evenly(&mut self, area: Area, count: u32) -> ControlFlow<(), Vec<Estimate>> {
-        let all: Vec<u32> = (0..area.pixel_count() as u32).collect();
+        let all = pixels_by_blocks(area);
         let mut pixels = vec![Runs::default(); all.len()];
-        self.extend(area, &all, 0..count, count, None, |pixel, color| pixels[pixel].add(color))?;
+        self.extend(area, &all, 0..count, count, None, |place, color| {
+            pixels[all[place] as usize].add(color);
+        })?;
         ControlFlow::Continue(pixels.iter().map(Runs::estimate).collect())
     }
 
@@ -84,11 +86,23 @@ impl<'a> Sampler<'a> {
         let near = area.with_rim();
         let far = near.with_rim();
         let wide = far.with_rim();
-        let all: Vec<u32> = (0..wide.pixel_count() as u32).collect();
-        let (mut colors, mut hits) = (Vec::with_capacity(all.len()), Vec::with_capacity(all.len()));
-        self.extend(wide, &all, 0..1, FEWEST_FOR_ERROR, Some(&mut hits), |_, color| {
-            colors.push(color);
-        })?;
+        let all = pixels_by_blocks(wide);
+        let mut colors = vec![DVec3::ZERO; all.len()];
+        let mut hits_by_blocks = Vec::with_capacity(all.len());
+        self.extend(
+            wide,
+            &all,
+            0..1,
+            FEWEST_FOR_ERROR,
+            Some(&mut hits_by_blocks),
+            |place, color| {
+                colors[all[place] as usize] = color;
+            },
+        )?;
+        let mut hits = hits_by_blocks.clone();
+        for (&pixel, hit) in all.iter().zip(hits_by_blocks) {
+            hits[pixel as usize] = hit;
+        }
         let (flat, seed) = (self.quality.flat, self.quality.seed);
         let mut search = UnseenSearch::new(self.view, area.frame(), flat, error, self.isa);
         let found = match &mut search {
@@ -276,6 +290,18 @@ impl OpenPixel {
         }
         self.pixel.set_unseen(unseen.variance(count));
     }
+}
+
+/// The places of the pixels of an area, block by block: the rays of a block go the same way and are
+/// traced together.
+fn pixels_by_blocks(area: Area) -> Vec<u32> {
+    let mut all = Vec::with_capacity(area.pixel_count());
+    for block in area.blocks(8) {
+        for y in block.rows() {
+            all.extend(block.columns().map(|x| area.index_of(x, y)));
+        }
+    }
+    all
 }
 
 /// The pixel (x, y) of the frame and its neighbours, by their places in an area that has them.

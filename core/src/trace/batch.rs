@@ -6,9 +6,11 @@
 use std::ops::ControlFlow;
 
 use super::{
-    boxes::{BoxKernel, KernelWork},
-    hit::{Nearest, between},
+    boxes::{BoxKernel, BoxRay, KernelWork},
+    hit::{Nearest, between, is_between, take_crossing},
     kernels::run_with_kernel,
+    lanes::MOST_RAYS,
+    packet::{Class, Meeting, Packet, PacketStack, visit_packet},
     ray::{Hit, Ray, Shear},
     solid::Scratch,
     traversal::{Stack, Step, visit},
@@ -18,7 +20,8 @@ use crate::{
     prepared::{
         face::Face,
         layout::View,
-        record::{LightRecord, Surface},
+        node::Frame,
+        record::{Item, LightRecord, Surface},
     },
 };
 
@@ -66,6 +69,50 @@ fn stop_unless(is_done: bool) -> ControlFlow<()> {
     if is_done { ControlFlow::Continue(()) } else { ControlFlow::Break(()) }
 }
 
+/// Fewer rays of a class than this are traced alone.
+const FEWEST_RAYS: usize = 8;
+
+/// Rays in the order in which they are traced: those of each class together, and at the end those
+/// that are in no packet.
+struct Order {
+    /// The places of the rays.
+    places: [u16; RAYS_A_REPORT],
+    /// The end of the run of each class.
+    ends: [u16; Class::COUNT + 1],
+}
+
+impl Order {
+    #[inline(always)]
+    fn new(rays: &[Ray], frame: &Frame) -> Self {
+        let mut classes = [0; RAYS_A_REPORT];
+        let mut ends = [0; Class::COUNT + 1];
+        for (class, ray) in classes.iter_mut().zip(rays) {
+            *class = Class::of(ray, frame).map_or(Class::COUNT, Class::index);
+            ends[*class] += 1;
+        }
+        let mut end = 0;
+        for count in &mut ends {
+            (*count, end) = (end, end + *count);
+        }
+        let mut places = [0; RAYS_A_REPORT];
+        for (place, &class) in (0..rays.len() as u16).zip(&classes) {
+            places[usize::from(ends[class])] = place;
+            ends[class] += 1;
+        }
+        Self { places, ends }
+    }
+
+    /// The rays in packets of one class, and whether they go together.
+    fn packets(&self) -> impl Iterator<Item = (&[u16], bool)> {
+        let firsts = std::iter::once(0).chain(self.ends);
+        firsts.zip(self.ends).enumerate().flat_map(|(class, (first, end))| {
+            let run = &self.places[usize::from(first)..usize::from(end)];
+            let is_class = class < Class::COUNT;
+            run.chunks(MOST_RAYS).map(move |run| (run, is_class && run.len() >= FEWEST_RAYS))
+        })
+    }
+}
+
 struct Trace<'a> {
     rays: &'a [Ray],
     hits: &'a mut Vec<Hit>,
@@ -76,18 +123,72 @@ impl KernelWork<View<'_>> for Trace<'_> {
     #[inline(always)]
     fn run(&mut self, view: &View<'_>, kernel: impl BoxKernel) {
         let (mut scratch, mut stack) = (Scratch::default(), Stack::default());
+        let (mut packet, mut packet_stack) = (Packet::new(), PacketStack::default());
         for rays in self.rays.chunks(RAYS_A_REPORT) {
             if (self.on_progress)().is_break() {
                 return;
             }
-            for ray in rays {
-                let mut nearest = Nearest::new(ray);
-                visit(kernel, view, ray, &mut stack, |item, box_ray| {
-                    nearest.meet(view, kernel, box_ray, item, &mut scratch);
-                    Step::On(nearest.hit.t)
-                });
-                self.hits.push(nearest.hit);
+            let first = self.hits.len();
+            self.hits.extend(rays.iter().map(|ray| Hit::none(ray.reach)));
+            let hits = &mut self.hits[first..];
+            for (members, go_together) in Order::new(rays, &view.header.frame).packets() {
+                if !go_together {
+                    for &member in members {
+                        let ray = &rays[usize::from(member)];
+                        let mut nearest = Nearest::new(ray);
+                        visit(kernel, view, ray, &mut stack, |item, box_ray| {
+                            if nearest.meet(view, kernel, box_ray, item, &mut scratch) {
+                                Step::On(nearest.hit.t)
+                            } else {
+                                Step::Past
+                            }
+                        });
+                        hits[usize::from(member)] = nearest.hit;
+                    }
+                    continue;
+                }
+                packet.fill(&view.header.frame, rays, members);
+                let stacks = (&mut packet_stack, &mut stack);
+                let scratch = &mut scratch;
+                let mut meeting = NearestOfPacket { view, kernel, rays, members, hits, scratch };
+                visit_packet(kernel, view, &mut packet, stacks, &mut meeting);
             }
+        }
+    }
+}
+
+/// The search for the nearest faces along the rays of a packet.
+struct NearestOfPacket<'a, K> {
+    view: &'a View<'a>,
+    kernel: K,
+    rays: &'a [Ray],
+    members: &'a [u16],
+    hits: &'a mut [Hit],
+    scratch: &'a mut Scratch,
+}
+
+impl<K: BoxKernel> Meeting for NearestOfPacket<'_, K> {
+    #[inline(always)]
+    fn cross(&mut self, place: usize, item: Item, t: f64) -> Step {
+        let member = usize::from(self.members[place]);
+        let hit = &mut self.hits[member];
+        if take_crossing(self.view, &self.rays[member], item, t, hit) {
+            Step::On(hit.t)
+        } else {
+            Step::Past
+        }
+    }
+
+    #[inline(always)]
+    fn ask(&mut self, place: usize, item: Item, shear: &Shear, box_ray: &BoxRay) -> Step {
+        let member = usize::from(self.members[place]);
+        let hit = &mut self.hits[member];
+        let mut nearest = Nearest { ray: &self.rays[member], shear: *shear, hit: *hit };
+        if nearest.meet(self.view, self.kernel, box_ray, item, self.scratch) {
+            *hit = nearest.hit;
+            Step::On(hit.t)
+        } else {
+            Step::Past
         }
     }
 }
@@ -104,24 +205,68 @@ impl KernelWork<View<'_>> for Shadows<'_> {
     #[inline(always)]
     fn run(&mut self, view: &View<'_>, kernel: impl BoxKernel) {
         let (mut scratch, mut stack) = (Scratch::default(), Stack::default());
+        let (mut packet, mut packet_stack) = (Packet::new(), PacketStack::default());
         for rays in self.rays.chunks(RAYS_A_REPORT) {
             if (self.on_progress)().is_break() {
                 return;
             }
-            for ray in rays {
-                let shear = Shear::new(ray.origin, ray.direction);
-                let mut is_blocked = false;
-                visit(kernel, view, ray, &mut stack, |item, box_ray| {
-                    let aim = (ray, &shear, box_ray, self.ending_on);
-                    between(view, kernel, aim, item, &mut scratch, |_, _| {
-                        is_blocked = true;
-                        true
+            let first = self.shares.len();
+            self.shares.resize(first + rays.len(), 1.0);
+            let shares = &mut self.shares[first..];
+            for (members, go_together) in Order::new(rays, &view.header.frame).packets() {
+                let (scratch, ending_on) = (&mut scratch, self.ending_on);
+                let mut meeting =
+                    BlockedOfPacket { view, kernel, rays, members, ending_on, shares, scratch };
+                if go_together {
+                    packet.fill(&view.header.frame, rays, members);
+                    let stacks = (&mut packet_stack, &mut stack);
+                    visit_packet(kernel, view, &mut packet, stacks, &mut meeting);
+                    continue;
+                }
+                for (place, &member) in members.iter().enumerate() {
+                    let ray = &rays[usize::from(member)];
+                    let shear = Shear::new(ray.origin, ray.direction);
+                    visit(kernel, view, ray, &mut stack, |item, box_ray| {
+                        meeting.ask(place, item, &shear, box_ray)
                     });
-                    if is_blocked { Step::Enough } else { Step::On(ray.reach) }
-                });
-                self.shares.push(if is_blocked { 0.0 } else { 1.0 });
+                }
             }
         }
+    }
+}
+
+/// The search for anything in the way of the rays of a packet.
+struct BlockedOfPacket<'a, K> {
+    view: &'a View<'a>,
+    kernel: K,
+    rays: &'a [Ray],
+    members: &'a [u16],
+    ending_on: &'a [Surface],
+    shares: &'a mut [f64],
+    scratch: &'a mut Scratch,
+}
+
+impl<K: BoxKernel> Meeting for BlockedOfPacket<'_, K> {
+    #[inline(always)]
+    fn cross(&mut self, place: usize, item: Item, t: f64) -> Step {
+        let member = usize::from(self.members[place]);
+        if is_between(self.view, &self.rays[member], self.ending_on, item, t) {
+            self.shares[member] = 0.0;
+            return Step::Enough;
+        }
+        Step::Past
+    }
+
+    #[inline(always)]
+    fn ask(&mut self, place: usize, item: Item, shear: &Shear, box_ray: &BoxRay) -> Step {
+        let member = usize::from(self.members[place]);
+        let share = &mut self.shares[member];
+        let aim = (&self.rays[member], shear, box_ray, self.ending_on);
+        between(self.view, self.kernel, aim, item, self.scratch, |_, _| {
+            *share = 0.0;
+            true
+        });
+        if *share == 0.0 { Step::Enough } else { Step::Past }
     }
 }
 
@@ -154,7 +299,7 @@ impl KernelWork<View<'_>> for ClearShadows<'_> {
                         crossed.push((rank, share));
                         is_blocked
                     });
-                    if is_blocked { Step::Enough } else { Step::On(ray.reach) }
+                    if is_blocked { Step::Enough } else { Step::Past }
                 });
                 // In an order that does not depend on the tree, for products round.
                 crossed.sort_unstable_by_key(|&(rank, _)| rank);

@@ -6,6 +6,7 @@
 
 use glam::DVec3;
 
+use super::lanes::{self, Beam, Crossings, GROUPS, LANES, RayGroup, larger, smaller};
 use crate::{
     exact::float::{above, below},
     prepared::node::{Frame, Node},
@@ -21,6 +22,8 @@ pub(super) struct BoxRay {
     pub(super) near_origin: [f32; 3],
     pub(super) far_origin: [f32; 3],
     pub(super) inverse: [f32; 3],
+    /// The same times [`FAR`], for far planes.
+    pub(super) far_inverse: [f32; 3],
     /// The stretch of the ray that counts; `high` is NaN for a ray that meets nothing.
     pub(super) low: f32,
     pub(super) high: f32,
@@ -38,7 +41,28 @@ pub(super) const FAR: f32 = 1.0 + 4.0 * f32::EPSILON;
 /// Three f32 roundings may move a near plane by 1.5 ulp away: so much more is within reach.
 const NEAR: f64 = 2.0 * f32::EPSILON as f64;
 
+/// A ray that starts nearer to its frame than this is taken as it is.
+pub(super) const NEAR_FRAME: f64 = 8.0;
+
+/// How much of the numbers around it a grazed plane's distance may be off: see `docs/proof.md`, boxes.
+const GRAZED: f64 = 1.0 / (1_u64 << 27) as f64;
+
 impl BoxRay {
+    /// A ray that meets nothing.
+    pub(super) const NOWHERE: Self = Self {
+        near: [0; 3],
+        far: [0; 3],
+        near_origin: [0.0; 3],
+        far_origin: [0.0; 3],
+        inverse: [0.0; 3],
+        far_inverse: [0.0; 3],
+        low: 0.0,
+        high: f32::NAN,
+        start: 0.0,
+        scale: 1.0,
+        slack: 0.0,
+    };
+
     #[inline(always)]
     pub(crate) fn new(origin: DVec3, direction: DVec3, reach: f64, frame: &Frame) -> Self {
         let mut relative = (origin - DVec3::from_array(frame.origin)) * frame.scale;
@@ -47,22 +71,17 @@ impl BoxRay {
         let mut start = 0.0;
         let mut blur = 0.0;
         let distance = relative.length();
-        if distance > 8.0 {
+        if distance > NEAR_FRAME {
             start = distance - 2.0;
             relative += start * direction;
             blur = 4.0 * f64::EPSILON * distance;
         }
         let mut ray = Self {
-            near: [0; 3],
-            far: [0; 3],
-            near_origin: [0.0; 3],
-            far_origin: [0.0; 3],
-            inverse: [0.0; 3],
             low: below(-start),
-            high: 0.0,
             start: start / frame.scale,
             scale: frame.scale,
-            slack: 16.0 * f64::EPSILON * (distance + 2.0),
+            slack: Self::slack(frame, distance),
+            ..Self::NOWHERE
         };
         ray.shorten(reach);
         let (o, d) = (relative.to_array(), direction.to_array());
@@ -74,6 +93,7 @@ impl BoxRay {
             let (low, high) = (below(o[axis] - blur), above(o[axis] + blur));
             let forward = inverse > 0.0;
             ray.inverse[axis] = inverse as f32;
+            ray.far_inverse[axis] = ray.inverse[axis] * FAR;
             ray.near[axis] = if forward { axis } else { axis + 3 };
             ray.far[axis] = if forward { axis + 3 } else { axis };
             ray.near_origin[axis] = if forward { high } else { low };
@@ -90,6 +110,19 @@ impl BoxRay {
             ray.high = f32::NAN;
         }
         ray
+    }
+
+    /// A ray that starts not far from the frame, without its start and its direction.
+    pub(super) fn near_frame(frame: &Frame) -> Self {
+        Self { scale: frame.scale, slack: Self::slack(frame, NEAR_FRAME), ..Self::NOWHERE }
+    }
+
+    /// What rounding takes from the distance of a plane that is all but grazed, by the plane's
+    /// own bound, for a ray that starts at a distance from the frame.
+    #[inline(always)]
+    fn slack(frame: &Frame, distance: f64) -> f64 {
+        let [x, y, z] = frame.origin.map(f64::abs);
+        GRAZED * (distance + 2.0 + (x + y + z) * frame.scale)
     }
 
     /// The same ray for boxes in another frame, for boxes that it enters before `reach` and leaves
@@ -113,8 +146,14 @@ impl BoxRay {
     /// what is in them may come first in the file.
     #[inline(always)]
     pub(super) fn shorten(&mut self, t: f64) {
+        self.high = self.reach(t);
+    }
+
+    /// How far a ray that ends at `t` reaches in the boxes' frame.
+    #[inline(always)]
+    pub(super) fn reach(&self, t: f64) -> f32 {
         let reach = (t - self.start) * self.scale + self.slack;
-        self.high = above(reach + reach.abs() * NEAR);
+        above(reach + reach.abs() * NEAR)
     }
 
     /// Where a box that begins at `near` begins along the ray, within rounding.
@@ -141,6 +180,35 @@ pub(super) trait BoxKernel: Copy {
     fn plain(self) -> Self::Plain;
 
     fn test(self, node: &Node, ray: &BoxRay) -> ([f32; 8], u32);
+
+    /// Which rays of a mask meet the box between three near and three far planes, as
+    /// [`BoxKernel::test`] tells it for each.
+    #[inline(always)]
+    fn enter(self, groups: &[RayGroup; GROUPS], planes: [[f32; 3]; 2], mask: u64) -> u64 {
+        lanes::enter(groups, planes, mask)
+    }
+
+    /// The boxes of a node that some ray may meet, a bit each, and where the first one may enter
+    /// them. Rounding keeps order: what a ray computes lies between what the ends of the intervals
+    /// give.
+    #[inline(always)]
+    fn meet_beam(self, node: &Node, beam: &Beam) -> ([f32; 8], u32) {
+        lanes::meet_beam(node, beam)
+    }
+
+    /// What the rays of a mask are to a triangle; its corners are in the order of the rays' axes.
+    /// Writes the distances of those that cross it for certain, the same to the bit as
+    /// `hit_triangle`.
+    #[inline(always)]
+    fn cross(
+        self,
+        groups: &[RayGroup; GROUPS],
+        corners: &[[f64; 3]; 3],
+        mask: u64,
+        distances: &mut [[f64; LANES]; GROUPS],
+    ) -> Crossings {
+        lanes::cross(groups, corners, mask, distances)
+    }
 }
 
 /// The kernel in plain Rust, for every CPU.
@@ -157,10 +225,7 @@ impl BoxKernel for ScalarBoxes {
 
     #[inline(always)]
     fn test(self, node: &Node, ray: &BoxRay) -> ([f32; 8], u32) {
-        // As the SIMD instructions have it: of a NaN (an origin on the plane of a box that the
-        // ray runs along) and a number, the second operand is taken.
-        let larger = |a: f32, b: f32| if a > b { a } else { b };
-        let smaller = |a: f32, b: f32| if a < b { a } else { b };
+        // NaN: an origin on the plane of a box that the ray runs along.
         let mut distances = [ray.low; 8];
         let mut mask = 0;
         for (child, enter) in distances.iter_mut().enumerate() {
@@ -169,7 +234,7 @@ impl BoxKernel for ScalarBoxes {
                 let near = node.planes[ray.near[axis]][child] - ray.near_origin[axis];
                 let far = node.planes[ray.far[axis]][child] - ray.far_origin[axis];
                 *enter = larger(near * ray.inverse[axis], *enter);
-                leave = smaller(far * ray.inverse[axis] * FAR, leave);
+                leave = smaller(far * ray.far_inverse[axis], leave);
             }
             mask |= u32::from(*enter <= leave) << child;
         }

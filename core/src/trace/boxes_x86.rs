@@ -1,13 +1,19 @@
-//! The test of a ray against a node's boxes with x86-64's instructions.
+//! The test of a ray against a node's boxes with x86-64's instructions, and those of several rays.
 
 use std::arch::x86_64::{
-    _CMP_LE_OQ, _mm_cmple_ps, _mm_loadu_ps, _mm_max_ps, _mm_min_ps, _mm_movemask_ps, _mm_mul_ps,
-    _mm_set1_ps, _mm_storeu_ps, _mm_sub_ps, _mm256_cmp_ps, _mm256_loadu_ps, _mm256_max_ps,
-    _mm256_min_ps, _mm256_movemask_ps, _mm256_mul_ps, _mm256_set1_ps, _mm256_storeu_ps,
-    _mm256_sub_ps,
+    _CMP_GT_OQ, _CMP_LE_OQ, _CMP_LT_OQ, _mm_cmple_ps, _mm_loadu_ps, _mm_max_ps, _mm_min_ps,
+    _mm_movemask_ps, _mm_mul_ps, _mm_set1_ps, _mm_storeu_ps, _mm_sub_ps, _mm256_add_pd,
+    _mm256_and_pd, _mm256_andnot_pd, _mm256_cmp_pd, _mm256_cmp_ps, _mm256_div_pd, _mm256_load_pd,
+    _mm256_load_ps, _mm256_loadu_ps, _mm256_max_pd, _mm256_max_ps, _mm256_min_pd, _mm256_min_ps,
+    _mm256_movemask_pd, _mm256_movemask_ps, _mm256_mul_pd, _mm256_mul_ps, _mm256_or_pd,
+    _mm256_set1_pd, _mm256_set1_ps, _mm256_setzero_pd, _mm256_storeu_pd, _mm256_storeu_ps,
+    _mm256_sub_pd, _mm256_sub_ps,
 };
 
-use super::boxes::{BoxKernel, BoxRay, FAR, KernelWork};
+use super::{
+    boxes::{BoxKernel, BoxRay, KernelWork},
+    lanes::{Beam, Crossings, GROUPS, LANES, RayGroup},
+};
 use crate::prepared::node::Node;
 
 /// The kernel with SSE2, four boxes at a time. Every x86-64 CPU has it.
@@ -45,8 +51,8 @@ impl BoxKernel for Sse2Boxes {
                     let near = _mm_sub_ps(near, _mm_set1_ps(ray.near_origin[axis]));
                     let far = _mm_sub_ps(far, _mm_set1_ps(ray.far_origin[axis]));
                     enter = _mm_max_ps(_mm_mul_ps(near, inverse), enter);
-                    let far = _mm_mul_ps(_mm_mul_ps(far, inverse), _mm_set1_ps(FAR));
-                    leave = _mm_min_ps(far, leave);
+                    let far_inverse = _mm_set1_ps(ray.far_inverse[axis]);
+                    leave = _mm_min_ps(_mm_mul_ps(far, far_inverse), leave);
                 }
                 _mm_storeu_ps(distances.as_mut_ptr().add(half), enter);
                 let met = _mm_movemask_ps(_mm_cmple_ps(enter, leave));
@@ -106,12 +112,143 @@ impl BoxKernel for Avx2Boxes {
                 let near = _mm256_sub_ps(near, _mm256_set1_ps(ray.near_origin[axis]));
                 let far = _mm256_sub_ps(far, _mm256_set1_ps(ray.far_origin[axis]));
                 enter = _mm256_max_ps(_mm256_mul_ps(near, inverse), enter);
-                let far = _mm256_mul_ps(_mm256_mul_ps(far, inverse), _mm256_set1_ps(FAR));
-                leave = _mm256_min_ps(far, leave);
+                let far_inverse = _mm256_set1_ps(ray.far_inverse[axis]);
+                leave = _mm256_min_ps(_mm256_mul_ps(far, far_inverse), leave);
             }
             _mm256_storeu_ps(distances.as_mut_ptr(), enter);
             _mm256_movemask_ps(_mm256_cmp_ps::<_CMP_LE_OQ>(enter, leave)) as u32
         };
         (distances, mask)
+    }
+
+    #[inline(always)]
+    fn enter(self, groups: &[RayGroup; GROUPS], [near, far]: [[f32; 3]; 2], mask: u64) -> u64 {
+        let mut met = 0;
+        // SAFETY: a value of this type says that the CPU has AVX2. The loads read arrays of
+        // exactly 8 floats.
+        unsafe {
+            let splat =
+                |x: [f32; 3]| [_mm256_set1_ps(x[0]), _mm256_set1_ps(x[1]), _mm256_set1_ps(x[2])];
+            let (near, far) = (splat(near), splat(far));
+            for (k, group) in groups.iter().enumerate() {
+                let asking = mask >> (LANES * k) & 0xFF;
+                if asking == 0 {
+                    continue;
+                }
+                let mut enter = _mm256_set1_ps(-0.0);
+                let mut leave = _mm256_load_ps(group.high.as_ptr());
+                for axis in 0..3 {
+                    let load = |lanes: &[[f32; LANES]; 3]| _mm256_load_ps(lanes[axis].as_ptr());
+                    let to_near = _mm256_sub_ps(near[axis], load(&group.near_origin));
+                    let to_far = _mm256_sub_ps(far[axis], load(&group.far_origin));
+                    enter = _mm256_max_ps(_mm256_mul_ps(to_near, load(&group.inverse)), enter);
+                    let to_far = _mm256_mul_ps(to_far, load(&group.far_inverse));
+                    leave = _mm256_min_ps(to_far, leave);
+                }
+                let is_met = _mm256_cmp_ps::<_CMP_LE_OQ>(enter, leave);
+                met |= (_mm256_movemask_ps(is_met) as u64 & asking) << (LANES * k);
+            }
+        }
+        met
+    }
+
+    #[inline(always)]
+    fn meet_beam(self, node: &Node, beam: &Beam) -> ([f32; 8], u32) {
+        let mut distances = [0.0; 8];
+        // SAFETY: a value of this type says that the CPU has AVX2. The loads read `planes[_]` and
+        // the store writes `distances`, exactly 8 floats each.
+        let mask = unsafe {
+            let mut enter = _mm256_set1_ps(-0.0);
+            let mut leave = _mm256_set1_ps(beam.high);
+            for axis in 0..3 {
+                let near = _mm256_loadu_ps(node.planes[beam.near[axis]].as_ptr());
+                let far = _mm256_loadu_ps(node.planes[beam.far[axis]].as_ptr());
+                let near = _mm256_sub_ps(near, _mm256_set1_ps(beam.near_origin[axis]));
+                let far = _mm256_sub_ps(far, _mm256_set1_ps(beam.far_origin[axis]));
+                let [a, b] = beam.inverse[axis];
+                let a = _mm256_mul_ps(near, _mm256_set1_ps(a));
+                let b = _mm256_mul_ps(near, _mm256_set1_ps(b));
+                enter = _mm256_max_ps(_mm256_min_ps(a, b), enter);
+                let [a, b] = beam.far_inverse[axis];
+                let a = _mm256_mul_ps(far, _mm256_set1_ps(a));
+                let b = _mm256_mul_ps(far, _mm256_set1_ps(b));
+                leave = _mm256_min_ps(_mm256_max_ps(a, b), leave);
+            }
+            _mm256_storeu_ps(distances.as_mut_ptr(), enter);
+            _mm256_movemask_ps(_mm256_cmp_ps::<_CMP_LE_OQ>(enter, leave)) as u32
+        };
+        (distances, mask)
+    }
+
+    #[inline(always)]
+    fn cross(
+        self,
+        groups: &[RayGroup; GROUPS],
+        corners: &[[f64; 3]; 3],
+        mask: u64,
+        distances: &mut [[f64; LANES]; GROUPS],
+    ) -> Crossings {
+        let mut crossings = Crossings::default();
+        // Half a group at a time.
+        for half in 0..2 * GROUPS {
+            let asking = mask >> (4 * half) & 0xF;
+            if asking == 0 {
+                continue;
+            }
+            let (group, first) = (&groups[half / 2], 4 * (half % 2));
+            // SAFETY: a value of this type says that the CPU has AVX2. The loads and the store
+            // take 4 of 8 numbers, from the first or from the fifth on.
+            let [possible, certain] = unsafe {
+                let load = |lanes: &[f64; LANES]| _mm256_load_pd(lanes.as_ptr().add(first));
+                let origin = [&group.origin[0], &group.origin[1], &group.origin[2]];
+                let slopes = [&group.slopes[0], &group.slopes[1], &group.slopes[2]];
+                let zero = _mm256_setzero_pd();
+                let [mut x, mut y, mut z] = [[zero; 3]; 3];
+                for (corner, at) in corners.iter().enumerate() {
+                    let depth = _mm256_sub_pd(_mm256_set1_pd(at[2]), load(origin[2]));
+                    let right = _mm256_sub_pd(_mm256_set1_pd(at[0]), load(origin[0]));
+                    let up = _mm256_sub_pd(_mm256_set1_pd(at[1]), load(origin[1]));
+                    x[corner] = _mm256_sub_pd(right, _mm256_mul_pd(load(slopes[0]), depth));
+                    y[corner] = _mm256_sub_pd(up, _mm256_mul_pd(load(slopes[1]), depth));
+                    z[corner] = _mm256_mul_pd(load(slopes[2]), depth);
+                }
+                let edge = |a: usize, b: usize| {
+                    _mm256_sub_pd(_mm256_mul_pd(x[a], y[b]), _mm256_mul_pd(y[a], x[b]))
+                };
+                let over = [edge(1, 2), edge(2, 0), edge(0, 1)];
+                let least = _mm256_min_pd(over[0], _mm256_min_pd(over[1], over[2]));
+                let most = _mm256_max_pd(over[0], _mm256_max_pd(over[1], over[2]));
+                let is_below = _mm256_cmp_pd::<_CMP_LT_OQ>(least, zero);
+                let is_above = _mm256_cmp_pd::<_CMP_GT_OQ>(most, zero);
+                let is_past = _mm256_and_pd(is_below, is_above);
+                let possible = !(_mm256_movemask_pd(is_past) as u64) & asking;
+                if possible == 0 {
+                    continue;
+                }
+                let sign = _mm256_set1_pd(-0.0);
+                let size = |a| _mm256_andnot_pd(sign, a);
+                let of_corner = |c: usize| _mm256_max_pd(size(x[c]), size(y[c]));
+                let extent = _mm256_max_pd(of_corner(0), _mm256_max_pd(of_corner(1), of_corner(2)));
+                let area = _mm256_add_pd(_mm256_add_pd(over[0], over[1]), over[2]);
+                let bound = _mm256_mul_pd(_mm256_mul_pd(extent, extent), _mm256_set1_pd(0.125));
+                let is_plain = _mm256_cmp_pd::<_CMP_GT_OQ>(size(area), bound);
+                let is_one_sided = _mm256_or_pd(
+                    _mm256_cmp_pd::<_CMP_GT_OQ>(least, zero),
+                    _mm256_cmp_pd::<_CMP_LT_OQ>(most, zero),
+                );
+                let is_certain = _mm256_and_pd(is_plain, is_one_sided);
+                let weighted = |k: usize| _mm256_mul_pd(over[k], z[k]);
+                let sum = _mm256_add_pd(_mm256_add_pd(weighted(0), weighted(1)), weighted(2));
+                let nearest = _mm256_min_pd(_mm256_min_pd(z[0], z[1]), z[2]);
+                let farthest = _mm256_max_pd(_mm256_max_pd(z[0], z[1]), z[2]);
+                let t = _mm256_max_pd(_mm256_div_pd(sum, area), nearest);
+                let t = _mm256_min_pd(t, farthest);
+                _mm256_storeu_pd(distances[half / 2].as_mut_ptr().add(first), t);
+                [possible, _mm256_movemask_pd(is_certain) as u64 & possible]
+            };
+            crossings.possible |= possible << (4 * half);
+            crossings.certain |= certain << (4 * half);
+        }
+        crossings
     }
 }

@@ -31,6 +31,7 @@ impl<'a> Nearest<'a> {
         Self { ray, shear, hit: Hit::none(ray.reach) }
     }
 
+    /// Tries an item; whether it is the nearest until now.
     #[inline(always)]
     pub(super) fn meet(
         &mut self,
@@ -39,7 +40,7 @@ impl<'a> Nearest<'a> {
         box_ray: &BoxRay,
         item: Item,
         scratch: &mut Scratch,
-    ) {
+    ) -> bool {
         let met = match item.kind() {
             Some(Kind::Solid) => {
                 let rays = (self.ray, box_ray);
@@ -47,13 +48,24 @@ impl<'a> Nearest<'a> {
             }
             _ => meet(view, self.ray, &self.shear, item),
         };
-        let Some((t, rank, part)) = met else {
-            return;
-        };
-        if t < self.hit.t || (t == self.hit.t && rank < self.hit.rank && self.hit.is_some()) {
-            self.hit = Hit { t, rank, face: Face { item, part } };
-        }
+        met.is_some_and(|met| take(&mut self.hit, item, met))
     }
+}
+
+/// Takes in where a ray meets an item; whether that is its nearest hit until now.
+#[inline(always)]
+fn take(hit: &mut Hit, item: Item, (t, rank, part): (f64, u32, Part)) -> bool {
+    let is_nearest = t < hit.t || (t == hit.t && rank < hit.rank && hit.is_some());
+    if is_nearest {
+        *hit = Hit { t, rank, face: Face { item, part } };
+    }
+    is_nearest
+}
+
+/// A ray crosses a triangle at a distance; whether that is its nearest hit until now.
+#[inline(always)]
+pub(super) fn take_crossing(view: &View<'_>, ray: &Ray, item: Item, t: f64, hit: &mut Hit) -> bool {
+    meet_triangle(view, ray, item, t).is_some_and(|met| take(hit, item, met))
 }
 
 /// The distance at which the ray crosses a face other than the one that it leaves, the face's rank,
@@ -64,29 +76,12 @@ fn meet(view: &View<'_>, ray: &Ray, shear: &Shear, item: Item) -> Option<(f64, u
     let index = item.index();
     let (t, rank) = match item.kind()? {
         Kind::Triangle => {
-            let face = &view.triangles[index];
-            let corners = shear.project_all(view.corners(&face.vertices));
-            let t = hit_triangle(corners)?;
-            if ray.leaving == Surface(face.rank) {
-                return None;
-            }
-            (t, face.rank)
+            let corners = shear.project_all(view.corners(&view.triangles[index].vertices));
+            return meet_triangle(view, ray, item, hit_triangle(corners)?);
         }
         Kind::Coplanar => {
-            let face = &view.coplanars[index];
-            let is_left = ray.leaving == face.plane.surface();
-            if is_left && face.rank <= ray.after {
-                return None;
-            }
-            let corners = shear.project_all(view.corners(&face.vertices));
-            let t = hit_triangle(corners)?;
-            if is_left {
-                return Some((0.0, face.rank, Part::WHOLE));
-            }
-            // The plane's distance, not this triangle's: coincident faces are met at one place.
-            let plane = &view.planes[face.plane.index()];
-            let [point, normal] = [plane.point, plane.normal].map(DVec3::from_array);
-            (hit_plane(ray, point, normal).unwrap_or(t), face.rank)
+            let corners = shear.project_all(view.corners(&view.coplanars[index].vertices));
+            return meet_triangle(view, ray, item, hit_triangle(corners)?);
         }
         Kind::Quadrangle => {
             let face = &view.quadrangles[index];
@@ -119,6 +114,43 @@ fn meet(view: &View<'_>, ray: &Ray, shear: &Shear, item: Item) -> Option<(f64, u
         Kind::Solid => return None,
     };
     (t > 0.0).then_some((t, rank, Part::WHOLE))
+}
+
+/// The same for a triangle that the ray crosses at a distance `t`, before or behind its start.
+#[inline(always)]
+fn meet_triangle(view: &View<'_>, ray: &Ray, item: Item, t: f64) -> Option<(f64, u32, Part)> {
+    let index = item.index();
+    let (t, rank) = if item.kind() == Some(Kind::Triangle) {
+        let face = &view.triangles[index];
+        if ray.leaving == Surface(face.rank) {
+            return None;
+        }
+        (t, face.rank)
+    } else {
+        let face = &view.coplanars[index];
+        if ray.leaving == face.plane.surface() {
+            return (face.rank > ray.after).then_some((0.0, face.rank, Part::WHOLE));
+        }
+        // The plane's distance, not this triangle's: coincident faces are met at one place.
+        let plane = &view.planes[face.plane.index()];
+        let [point, normal] = [plane.point, plane.normal].map(DVec3::from_array);
+        (hit_plane(ray, point, normal).unwrap_or(t), face.rank)
+    };
+    (t > 0.0).then_some((t, rank, Part::WHOLE))
+}
+
+/// Whether a triangle that the ray crosses at a distance `t` is between the ray's start and its
+/// end, which is a light that the surfaces `ending_on` contain.
+#[inline(always)]
+pub(super) fn is_between(
+    view: &View<'_>,
+    ray: &Ray,
+    ending_on: &[Surface],
+    item: Item,
+    t: f64,
+) -> bool {
+    (ending_on.is_empty() || !ending_on.contains(&Face::whole(item).surface(view)))
+        && meet_triangle(view, ray, item, t).is_some_and(|(t, ..)| t < ray.reach)
 }
 
 /// The same for a solid, up to `reach`.

@@ -26,8 +26,17 @@ mod tests {
 
     use super::*;
     use crate::{
-        prepared::node::{Child, Frame, Node},
-        trace::boxes::{BoxKernel, BoxRay},
+        prepared::{
+            node::{Child, Frame, Node},
+            record::Surface,
+        },
+        trace::{
+            boxes::{BoxKernel, BoxRay},
+            lanes::{Crossings, MOST_RAYS},
+            packet::{Class, Packet},
+            ray::{Ray, Shear},
+            triangle::hit_triangle,
+        },
     };
 
     /// Nodes with boxes of all kinds: thick, flat, touching, far away, unused.
@@ -107,5 +116,137 @@ mod tests {
             }
         }
         assert!(met > 2_000, "{met} of 160,000 boxes are met");
+    }
+
+    /// Rays of one class, with the triangles and boxes that they are tried on: grids and
+    /// shared starts, so that edges, corners and planes are met.
+    struct Group {
+        frame: Frame,
+        rays: Vec<Ray>,
+        packet: Packet,
+        corners: [[f64; 3]; 3],
+        node: Node,
+        mask: u64,
+    }
+
+    impl Group {
+        fn random(random: &mut Random) -> Self {
+            let frame = Frame { origin: [0.0; 3], scale: 1.0 };
+            let mut point = || DVec3::from_array([(); 3].map(|()| grid_or_any(random)));
+            let eye = point();
+            let corners = [point(), point(), point()];
+            let mut rays = Vec::new();
+            for _ in 0..MOST_RAYS {
+                let [a, b, c] = corners;
+                let target = match random.below(4) {
+                    0 => corners[random.below(3)],
+                    1 => a + random.unit() * (b - a),
+                    _ => a + random.unit() * (b - a) + random.unit() * (c - a),
+                };
+                let origin = if random.chance(0.7) { eye } else { eye + 0.1 * random.in_cube() };
+                let reach = [f64::INFINITY, 0.5, 3.0][random.below(3)];
+                let (leaving, after) = (Surface::NONE, Ray::NOTHING_AHEAD);
+                let direction = (target - origin).normalize();
+                let direction = if direction.is_finite() { direction } else { DVec3::Y };
+                rays.push(Ray { origin, direction, reach, leaving, after });
+            }
+            let class = Class::of(&rays[0], &frame);
+            rays.retain(|ray| class.is_some() && Class::of(ray, &frame) == class);
+            let mut packet = Packet::new();
+            if !rays.is_empty() {
+                let members: Vec<u16> = (0..rays.len() as u16).collect();
+                packet.fill(&frame, &rays, &members);
+            }
+            let [x, y, z] = packet.axes;
+            let corners = corners.map(|corner| [corner[x], corner[y], corner[z]]);
+            let node = random_node(random);
+            let mask = random.bits() & packet.alive;
+            Self { frame, rays, packet, corners, node, mask }
+        }
+
+        fn planes(&self, child: usize) -> [[f32; 3]; 2] {
+            [self.packet.beam.near, self.packet.beam.far]
+                .map(|sides| sides.map(|side| self.node.planes[side][child]))
+        }
+    }
+
+    /// What a kernel finds: the rays that enter each box, the boxes that the beam may meet, and
+    /// where rays cross the triangle.
+    #[derive(Debug, PartialEq)]
+    struct FoundByGroup {
+        entering: [u64; 8],
+        met: u32,
+        nears: [u32; 8],
+        crossings: Crossings,
+        distances: Vec<Option<u64>>,
+    }
+
+    impl KernelWork<Group> for Option<FoundByGroup> {
+        fn run(&mut self, group: &Group, kernel: impl BoxKernel) {
+            let Group { packet, corners, node, mask, .. } = group;
+            let mut entering = [0; 8];
+            for (child, entering) in entering.iter_mut().enumerate() {
+                *entering = kernel.enter(&packet.groups, group.planes(child), *mask);
+            }
+            let (nears, met) = kernel.meet_beam(node, &packet.beam);
+            let mut distances = packet.crossings;
+            let crossings = kernel.cross(&packet.groups, corners, *mask, &mut distances);
+            let distances = (distances.as_flattened().iter().enumerate())
+                .map(|(k, t)| (crossings.certain >> k & 1 == 1).then_some(t.to_bits()))
+                .collect();
+            let nears = nears.map(f32::to_bits);
+            *self = Some(FoundByGroup { entering, met, nears, crossings, distances });
+        }
+    }
+
+    #[test]
+    fn rays_of_a_group_meet_what_each_meets_alone() {
+        let random = &mut Random::new(18);
+        let (mut entered, mut crossed, mut doubted) = (0, 0, 0);
+        for _ in 0..2_000 {
+            let group = Group::random(random);
+            let find = |isa| {
+                let mut found = None;
+                run_with_kernel(isa, &group, &mut found);
+                found.expect("the kernel ran")
+            };
+            let found = find(Isa::Scalar);
+            for isa in Isa::ALL.into_iter().filter(|isa| isa.is_supported()) {
+                assert_eq!(find(isa), found, "{isa}");
+            }
+            for (k, ray) in group.rays.iter().enumerate() {
+                if group.mask >> k & 1 == 0 {
+                    continue;
+                }
+                let box_ray = BoxRay::new(ray.origin, ray.direction, ray.reach, &group.frame);
+                let (_, met) = ScalarBoxes.test(&group.node, &box_ray);
+                for (child, entering) in found.entering.iter().enumerate() {
+                    let enters = entering >> k & 1 == 1;
+                    assert_eq!(enters, met >> child & 1 == 1, "{ray:?}");
+                    assert!(!enters || found.met >> child & 1 == 1, "{ray:?}");
+                    entered += u32::from(enters);
+                }
+                let [x, y, z] = group.packet.axes;
+                let corners = group.corners.map(|corner| {
+                    let mut plain = [0.0; 3];
+                    (plain[x], plain[y], plain[z]) = (corner[0], corner[1], corner[2]);
+                    plain
+                });
+                let shear = Shear::new(ray.origin, ray.direction);
+                let [a, b, c] = &corners;
+                let t = hit_triangle(shear.project_all([a, b, c])).map(f64::to_bits);
+                let is = |mask: u64| mask >> k & 1 == 1;
+                if is(found.crossings.certain) {
+                    assert_eq!(found.distances[k], t, "{ray:?}");
+                }
+                assert!(is(found.crossings.possible) || t.is_none(), "{ray:?}");
+                crossed += u32::from(is(found.crossings.certain));
+                doubted += u32::from(is(found.crossings.possible & !found.crossings.certain));
+            }
+        }
+        assert!(
+            entered > 1_000 && crossed > 1_000 && doubted > 1_000,
+            "{entered} boxes are entered, {crossed} triangles crossed, {doubted} in doubt"
+        );
     }
 }

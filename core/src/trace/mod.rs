@@ -8,6 +8,8 @@ mod boxes_x86;
 mod course;
 mod hit;
 mod kernels;
+mod lanes;
+mod packet;
 mod parallelepiped;
 #[cfg(target_arch = "x86_64")]
 #[expect(unsafe_code, reason = "SIMD intrinsics")]

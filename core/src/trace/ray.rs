@@ -60,9 +60,9 @@ impl Hit {
 /// largest component becomes the depth axis and the other two are sheared along it.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Shear {
-    axes: [usize; 3],
-    origin: [f64; 3],
-    slopes: [f64; 3],
+    pub(super) axes: [usize; 3],
+    pub(super) origin: [f64; 3],
+    pub(super) slopes: [f64; 3],
 }
 
 /// A vertex as a ray sees it.
@@ -74,18 +74,24 @@ pub(super) struct Projected {
     pub(super) z: f64,
 }
 
+/// The axis of a direction's largest component, the last one of several.
+#[inline(always)]
+pub(super) fn depth_axis(d: [f64; 3]) -> usize {
+    let [x, y, z] = [d[0].abs(), d[1].abs(), d[2].abs()];
+    if x > y {
+        if x > z { 0 } else { 2 }
+    } else if y > z {
+        1
+    } else {
+        2
+    }
+}
+
 impl Shear {
     #[inline(always)]
     pub(crate) fn new(origin: DVec3, direction: DVec3) -> Self {
         let d = direction.to_array();
-        let size = d.map(f64::abs);
-        let z = if size[0] > size[1] {
-            if size[0] > size[2] { 0 } else { 2 }
-        } else if size[1] > size[2] {
-            1
-        } else {
-            2
-        };
+        let z = depth_axis(d);
         let (x, y) = ((z + 1) % 3, (z + 2) % 3);
         let o = origin.to_array();
         Self {

@@ -11,7 +11,7 @@ use crate::prepared::{
 };
 
 /// Children that may wait while a ray visits others: seven on each level and the last node's.
-const STACK: usize = 7 * MOST_LEVELS + 8;
+pub(super) const STACK: usize = 7 * MOST_LEVELS + 8;
 
 /// Room for them. A batch's rays share it: to fill it anew for each would cost as much as the ray.
 pub(super) struct Stack([(f32, Child); STACK]);
@@ -24,6 +24,8 @@ impl Default for Stack {
 
 /// What to do after a face.
 pub(super) enum Step {
+    /// Go on: it meant nothing.
+    Past,
     /// Go on with what is nearer than this.
     On(f64),
     /// The answer is known.
@@ -49,25 +51,38 @@ pub(super) fn visit_nodes(
     kernel: impl BoxKernel,
     view: &View<'_>,
     ray: &Ray,
+    stack: &mut Stack,
+    enter: impl FnMut(),
+    meet: impl FnMut(Item, &BoxRay) -> Step,
+) {
+    let mut box_ray = BoxRay::new(ray.origin, ray.direction, ray.reach, &view.header.frame);
+    visit_from(kernel, view, (&mut box_ray, Child::ROOT), stack, enter, meet);
+}
+
+/// The same below one child alone; whether the answer is known.
+#[inline(always)]
+pub(super) fn visit_from(
+    kernel: impl BoxKernel,
+    view: &View<'_>,
+    (box_ray, mut current): (&mut BoxRay, Child),
     Stack(stack): &mut Stack,
     mut enter: impl FnMut(),
     mut meet: impl FnMut(Item, &BoxRay) -> Step,
-) {
-    let mut box_ray = BoxRay::new(ray.origin, ray.direction, ray.reach, &view.header.frame);
+) -> bool {
     let mut waiting = 0;
-    let mut current = Child::ROOT;
     loop {
         if current.is_leaf() {
             for &item in &view.items[current.items()] {
-                match meet(item, &box_ray) {
+                match meet(item, box_ray) {
+                    Step::Past => {}
                     Step::On(reach) => box_ray.shorten(reach),
-                    Step::Enough => return,
+                    Step::Enough => return true,
                 }
             }
         } else {
             enter();
             let node = &view.nodes[current.node()];
-            let (distances, mut mask) = kernel.test(node, &box_ray);
+            let (distances, mut mask) = kernel.test(node, box_ray);
             let first = waiting;
             while mask != 0 {
                 let child = mask.trailing_zeros() as usize & 7;
@@ -84,7 +99,7 @@ pub(super) fn visit_nodes(
         }
         current = loop {
             if waiting == 0 {
-                return;
+                return false;
             }
             waiting -= 1;
             let (near, child) = stack[waiting];

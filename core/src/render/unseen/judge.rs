@@ -16,6 +16,10 @@ const NEGLIGIBLE: f64 = 1.0 / 64.0;
 /// The share of a picture's error that all faces of a pixel may add unseen.
 const NEGLIGIBLE_SUM: f64 = 1.0 / 8.0;
 
+/// A face counts in a pixel if it begins at most this many times as deep as the deepest of what the
+/// pixel's samples met.
+pub(super) const DEPTH_RATIO: f64 = 1.25;
+
 /// A pixel's first sample.
 #[derive(Debug, Clone, Copy)]
 pub(in crate::render) struct FirstSample {

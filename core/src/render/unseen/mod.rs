@@ -26,7 +26,7 @@ use glam::DVec3;
 
 use self::{
     frustum::FrustumSearch,
-    judge::{Judge, Sight},
+    judge::{DEPTH_RATIO, Judge, Sight},
     onward::{OnwardSearch, Tools},
     screen::{Beam, Reach, Rectangle, Screen},
 };
@@ -47,10 +47,6 @@ const MOST_FACES: usize = 128;
 /// In a crowded pixel faces count that stand this many pixels' widths before all that its samples
 /// met.
 const CROWDED_CLEARANCE: f64 = 8.0;
-
-/// A face counts in a pixel if it begins at most this many times as deep as the deepest of what the
-/// pixel's samples met.
-const DEPTH_RATIO: f64 = 1.25;
 
 /// The search for what pixels may hide.
 pub(super) struct UnseenSearch<'a> {

@@ -9,10 +9,9 @@ use std::ops::ControlFlow;
 use glam::DVec3;
 
 use super::{
-    DEPTH_RATIO,
     faces::UnseenFaces,
     frustum::FrustumSearch,
-    judge::{FirstSample, Judge, Sight},
+    judge::{DEPTH_RATIO, FirstSample, Judge, Sight},
     outline::Outline,
     screen::{Beam, Reach, Rectangle, Screen, Sheet},
 };

@@ -1,0 +1,187 @@
+//! Rays side by side, a lane each, and the tests that several of them take at once.
+
+use super::ray::{Shear, edge};
+use crate::prepared::node::Node;
+
+/// Rays that are tested at once.
+pub(super) const LANES: usize = 8;
+
+/// Groups of [`LANES`] rays.
+pub(super) const GROUPS: usize = 8;
+
+/// The most rays: a bit each in a mask.
+pub(super) const MOST_RAYS: usize = LANES * GROUPS;
+
+/// What [`LANES`] rays are to boxes, as a `BoxRay` has it, and to flat faces, as a [`Shear`] has it.
+#[derive(Debug, Clone, Copy)]
+#[repr(C, align(64))]
+pub(super) struct RayGroup {
+    pub(super) near_origin: [[f32; LANES]; 3],
+    pub(super) far_origin: [[f32; LANES]; 3],
+    pub(super) inverse: [[f32; LANES]; 3],
+    pub(super) far_inverse: [[f32; LANES]; 3],
+    pub(super) high: [f32; LANES],
+    /// In the order of the axes of the rays' [`Shear`].
+    pub(super) origin: [[f64; LANES]; 3],
+    pub(super) slopes: [[f64; LANES]; 3],
+}
+
+impl RayGroup {
+    pub(super) const EMPTY: Self = Self {
+        near_origin: [[0.0; LANES]; 3],
+        far_origin: [[0.0; LANES]; 3],
+        inverse: [[0.0; LANES]; 3],
+        far_inverse: [[0.0; LANES]; 3],
+        high: [0.0; LANES],
+        origin: [[0.0; LANES]; 3],
+        slopes: [[0.0; LANES]; 3],
+    };
+}
+
+/// Intervals that hold what the rays of some groups have.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Beam {
+    /// Which of a node's planes is met first on each axis, and which last.
+    pub(super) near: [usize; 3],
+    pub(super) far: [usize; 3],
+    /// The start that is nearest to a near plane, and the one that is farthest from a far plane.
+    pub(super) near_origin: [f32; 3],
+    pub(super) far_origin: [f32; 3],
+    /// The least and the greatest.
+    pub(super) inverse: [[f32; 2]; 3],
+    pub(super) far_inverse: [[f32; 2]; 3],
+    /// How far the farthest ray reaches.
+    pub(super) high: f32,
+}
+
+impl Beam {
+    pub(super) const EMPTY: Self = Self {
+        near: [0; 3],
+        far: [0; 3],
+        near_origin: [0.0; 3],
+        far_origin: [0.0; 3],
+        inverse: [[0.0; 2]; 3],
+        far_inverse: [[0.0; 2]; 3],
+        high: 0.0,
+    };
+}
+
+/// What rays are to a triangle, a bit each.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub(super) struct Crossings {
+    /// They may cross it: of the others two edge functions have opposite signs.
+    pub(super) possible: u64,
+    /// They cross it for certain, and their distances are known.
+    pub(super) certain: u64,
+}
+
+/// The smaller number as the SIMD instructions have it: of a NaN and a number, the second operand.
+#[inline(always)]
+pub(super) fn smaller(a: f32, b: f32) -> f32 {
+    if a < b { a } else { b }
+}
+
+/// The larger number in the same way.
+#[inline(always)]
+pub(super) fn larger(a: f32, b: f32) -> f32 {
+    if a > b { a } else { b }
+}
+
+/// The rays of a mask for which `test` of their group says so.
+#[inline(always)]
+fn by_groups(mask: u64, mut test: impl FnMut(usize) -> u64) -> u64 {
+    let mut met = 0;
+    for group in 0..GROUPS {
+        let asking = mask >> (LANES * group) & 0xFF;
+        if asking != 0 {
+            met |= (test(group) & asking) << (LANES * group);
+        }
+    }
+    met
+}
+
+/// `BoxKernel::enter` in plain Rust.
+#[inline(always)]
+pub(super) fn enter(groups: &[RayGroup; GROUPS], [near, far]: [[f32; 3]; 2], mask: u64) -> u64 {
+    by_groups(mask, |group| {
+        let group = &groups[group];
+        let mut met = 0;
+        for lane in 0..LANES {
+            let (mut enter, mut leave) = (-0.0, group.high[lane]);
+            for axis in 0..3 {
+                let to_near = near[axis] - group.near_origin[axis][lane];
+                let to_far = far[axis] - group.far_origin[axis][lane];
+                enter = larger(to_near * group.inverse[axis][lane], enter);
+                leave = smaller(to_far * group.far_inverse[axis][lane], leave);
+            }
+            met |= u64::from(enter <= leave) << lane;
+        }
+        met
+    })
+}
+
+/// `BoxKernel::meet_beam` in plain Rust.
+#[inline(always)]
+pub(super) fn meet_beam(node: &Node, beam: &Beam) -> ([f32; 8], u32) {
+    let mut distances = [-0.0; 8];
+    let mut mask = 0;
+    for (child, enter) in distances.iter_mut().enumerate() {
+        let mut leave = beam.high;
+        for axis in 0..3 {
+            let near = node.planes[beam.near[axis]][child] - beam.near_origin[axis];
+            let far = node.planes[beam.far[axis]][child] - beam.far_origin[axis];
+            let [a, b] = beam.inverse[axis];
+            *enter = larger(smaller(near * a, near * b), *enter);
+            let [a, b] = beam.far_inverse[axis];
+            leave = smaller(larger(far * a, far * b), leave);
+        }
+        mask |= u32::from(*enter <= leave) << child;
+    }
+    (distances, mask)
+}
+
+/// `BoxKernel::cross` in plain Rust.
+#[inline(always)]
+pub(super) fn cross(
+    groups: &[RayGroup; GROUPS],
+    corners: &[[f64; 3]; 3],
+    mask: u64,
+    distances: &mut [[f64; LANES]; GROUPS],
+) -> Crossings {
+    let mut certain = 0;
+    let possible = by_groups(mask, |k| {
+        let group = &groups[k];
+        let mut possible = 0;
+        for (lane, distance) in distances[k].iter_mut().enumerate() {
+            let shear = shear_at(group, lane, [0, 1, 2]);
+            let [a, b, c] = shear.project_all([&corners[0], &corners[1], &corners[2]]);
+            let over = [edge(&b, &c), edge(&c, &a), edge(&a, &b)];
+            let is_any = |is: fn(f64) -> bool| over.into_iter().any(is);
+            if is_any(|w| w < 0.0) && is_any(|w| w > 0.0) {
+                continue;
+            }
+            possible |= 1 << lane;
+            let extent = [a, b, c].iter().map(|p| p.x.abs().max(p.y.abs())).fold(0.0, f64::max);
+            let area = over[0] + over[1] + over[2];
+            if !over.contains(&0.0) && area.abs() > extent * extent / 8.0 {
+                certain |= 1 << (LANES * k + lane);
+                let t = (over[0] * a.z + over[1] * b.z + over[2] * c.z) / area;
+                let (least, most) = (a.z.min(b.z).min(c.z), a.z.max(b.z).max(c.z));
+                *distance = t.max(least).min(most);
+            }
+        }
+        possible
+    });
+    Crossings { possible, certain: certain & mask }
+}
+
+/// What a lane holds, as a [`Shear`] with these axes.
+#[inline(always)]
+pub(super) fn shear_at(group: &RayGroup, lane: usize, axes: [usize; 3]) -> Shear {
+    let mut shear = Shear { axes, origin: [0.0; 3], slopes: [0.0; 3] };
+    for axis in 0..3 {
+        shear.origin[axis] = group.origin[axis][lane];
+        shear.slopes[axis] = group.slopes[axis][lane];
+    }
+    shear
+}

@@ -1,0 +1,473 @@
+//! Packets: rays that go the same way are taken through the hierarchy together.
+//!
+//! A ray meets the same boxes and the same faces as alone, bit for bit; only the order may be
+//! another, on which no answer depends. Where few rays of a packet are left they go on alone.
+//!
+//! Sources: Wald, Slusallek, Benthin & Wagner, "Interactive Rendering with Coherent Ray Tracing"
+//! (2001); a beam of intervals that rejects boxes for all rays, Boulos, Wald & Shirley, "Geometric
+//! and Arithmetic Culling Methods for Entire Ray Packets" (2006); going on alone, Benthin, Wald,
+//! Woop, Ernst & Mark, "Combining Single and Packet-Ray Tracing for Arbitrary Ray Distributions
+//! on the Intel MIC Architecture" (2012).
+
+use super::{
+    boxes::{BoxKernel, BoxRay, FAR, NEAR_FRAME},
+    lanes::{Beam, GROUPS, LANES, MOST_RAYS, RayGroup, larger, shear_at, smaller},
+    ray::{Ray, Shear, depth_axis},
+    traversal::{STACK, Stack, Step, visit_from},
+};
+use crate::{
+    exact::float::{above, below},
+    prepared::{
+        layout::View,
+        node::{Child, Frame},
+        record::{Item, Kind},
+    },
+};
+
+/// So many rays, or fewer, go on alone.
+const FEW: u32 = 2;
+
+/// What rays of a packet have in common: the signs of their direction, and its largest component.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Class(u8);
+
+impl Class {
+    /// Classes are numbered from 0 up to this.
+    pub(super) const COUNT: usize = 3 * 8;
+
+    /// The class of a ray; `None` for one that can be in no packet: along some axis it as good as
+    /// stands still, or it starts nowhere or far from the frame.
+    #[inline(always)]
+    pub(super) fn of(ray: &Ray, frame: &Frame) -> Option<Self> {
+        let [o, d] = [ray.origin.to_array(), ray.direction.to_array()];
+        let mut class = 8 * depth_axis(d) as u8;
+        let mut distance = 0.0;
+        let mut is_plain = true;
+        for axis in 0..3 {
+            let relative = (o[axis] - frame.origin[axis]) * frame.scale;
+            distance += relative * relative;
+            is_plain &= d[axis].abs() >= 1e-30;
+            class |= u8::from(d[axis] > 0.0) << axis;
+        }
+        (is_plain && distance <= NEAR_FRAME * NEAR_FRAME).then_some(Self(class))
+    }
+
+    /// The class as a number.
+    #[inline(always)]
+    pub(super) fn index(self) -> usize {
+        usize::from(self.0)
+    }
+}
+
+/// Up to [`MOST_RAYS`] rays of one class.
+pub(super) struct Packet {
+    pub(super) groups: [RayGroup; GROUPS],
+    pub(super) beam: Beam,
+    /// Where the rays cross a triangle.
+    pub(super) crossings: [[f64; LANES]; GROUPS],
+    /// How distances are turned into the boxes' frame.
+    turn: BoxRay,
+    /// The axes of each [`Shear`].
+    pub(super) axes: [usize; 3],
+    /// The rays that still look for something, a bit each.
+    pub(super) alive: u64,
+}
+
+/// Children that wait, each with where it begins and the rays that enter it.
+pub(super) struct PacketStack([(f32, Child, u64); STACK]);
+
+impl Default for PacketStack {
+    fn default() -> Self {
+        Self([(0.0, Child::NONE, 0); STACK])
+    }
+}
+
+/// The least and the greatest number of each lane.
+#[derive(Clone, Copy)]
+struct Span([[f32; LANES]; 2]);
+
+impl Span {
+    const NONE: Self = Self([[f32::INFINITY; LANES], [f32::NEG_INFINITY; LANES]]);
+
+    #[inline(always)]
+    fn take(&mut self, lanes: &[f32; LANES]) {
+        let [least, most] = &mut self.0;
+        for (least, &x) in least.iter_mut().zip(lanes) {
+            *least = smaller(x, *least);
+        }
+        for (most, &x) in most.iter_mut().zip(lanes) {
+            *most = larger(x, *most);
+        }
+    }
+
+    #[inline(always)]
+    fn ends(&self) -> [f32; 2] {
+        let [least, most] = self.0;
+        [least.into_iter().fold(least[0], smaller), most.into_iter().fold(most[0], larger)]
+    }
+}
+
+/// What is done with what rays of a packet meet.
+pub(super) trait Meeting {
+    /// The ray at a place in the packet crosses a triangle at a distance, before or behind its start.
+    fn cross(&mut self, place: usize, item: Item, t: f64) -> Step;
+
+    /// The ray may meet an item.
+    fn ask(&mut self, place: usize, item: Item, shear: &Shear, box_ray: &BoxRay) -> Step;
+}
+
+impl Packet {
+    /// A packet of no rays.
+    pub(super) fn new() -> Self {
+        Self {
+            groups: [RayGroup::EMPTY; GROUPS],
+            beam: Beam::EMPTY,
+            crossings: [[0.0; LANES]; GROUPS],
+            turn: BoxRay::NOWHERE,
+            axes: [0; 3],
+            alive: 0,
+        }
+    }
+
+    /// Takes in the `members` of `rays`, which are of one class: at least one. Every number is that of
+    /// [`BoxRay::new`] and [`Shear::new`].
+    #[inline(always)]
+    pub(super) fn fill(&mut self, frame: &Frame, rays: &[Ray], members: &[u16]) {
+        let first = rays[usize::from(members[0])];
+        let [x, y, z] = Shear::new(first.origin, first.direction).axes;
+        self.axes = [x, y, z];
+        self.alive = u64::MAX >> (MOST_RAYS - members.len());
+        self.turn = BoxRay::near_frame(frame);
+        let mut spans = [[Span::NONE; 4]; 3];
+        self.beam.high = f32::NEG_INFINITY;
+        for axis in 0..3 {
+            (self.beam.near[axis], self.beam.far[axis]) =
+                if first.direction[axis] > 0.0 { (axis, axis + 3) } else { (axis + 3, axis) };
+        }
+        // Where a start is on an axis, as near and as far planes want it.
+        let in_frame = |o: f64, axis: usize| {
+            let relative = (o - frame.origin[axis]) * frame.scale;
+            let (low, high) = (below(relative), above(relative));
+            if first.direction[axis] > 0.0 { (high, low) } else { (low, high) }
+        };
+        let is_same = |&member: &u16| rays[usize::from(member)].origin == first.origin;
+        let has_one_start = members.iter().all(is_same);
+        for (group, members) in self.groups.iter_mut().zip(members.chunks(LANES)) {
+            let (mut origin, mut direction) = ([[0.0; LANES]; 3], [[0.0; LANES]; 3]);
+            // Lanes without a ray have the last one.
+            let last = members[members.len() - 1];
+            let all = members.iter().chain(std::iter::repeat(&last));
+            for ((lane, high), &member) in group.high.iter_mut().enumerate().zip(all) {
+                let ray = &rays[usize::from(member)];
+                for axis in 0..3 {
+                    origin[axis][lane] = ray.origin[axis];
+                    direction[axis][lane] = ray.direction[axis];
+                }
+                *high = self.turn.reach(ray.reach);
+                self.beam.high = larger(*high, self.beam.high);
+            }
+            for axis in 0..3 {
+                if has_one_start {
+                    let (near, far) = in_frame(first.origin[axis], axis);
+                    group.near_origin[axis] = [near; LANES];
+                    group.far_origin[axis] = [far; LANES];
+                } else {
+                    for (lane, &o) in origin[axis].iter().enumerate() {
+                        (group.near_origin[axis][lane], group.far_origin[axis][lane]) =
+                            in_frame(o, axis);
+                    }
+                }
+                for (lane, d) in direction[axis].iter().enumerate() {
+                    let inverse = (1.0 / d) as f32;
+                    group.inverse[axis][lane] = inverse;
+                    group.far_inverse[axis][lane] = inverse * FAR;
+                }
+                spans[axis][0].take(&group.near_origin[axis]);
+                spans[axis][1].take(&group.far_origin[axis]);
+                spans[axis][2].take(&group.inverse[axis]);
+                spans[axis][3].take(&group.far_inverse[axis]);
+            }
+            group.origin = [origin[x], origin[y], origin[z]];
+            for (lane, d) in direction[z].iter().enumerate() {
+                group.slopes[0][lane] = direction[x][lane] / d;
+                group.slopes[1][lane] = direction[y][lane] / d;
+                group.slopes[2][lane] = 1.0 / d;
+            }
+        }
+        for (axis, spans) in spans.iter().enumerate() {
+            let [near_origin, far_origin, inverse, far_inverse] = spans;
+            let forward = usize::from(first.direction[axis] > 0.0);
+            self.beam.near_origin[axis] = near_origin.ends()[forward];
+            self.beam.far_origin[axis] = far_origin.ends()[1 - forward];
+            self.beam.inverse[axis] = inverse.ends();
+            self.beam.far_inverse[axis] = far_inverse.ends();
+        }
+    }
+
+    /// A ray as boxes want it.
+    #[inline(always)]
+    fn box_ray(&self, place: usize) -> BoxRay {
+        let (group, lane) = (&self.groups[place / LANES], place % LANES);
+        let mut ray = self.turn;
+        (ray.near, ray.far) = (self.beam.near, self.beam.far);
+        for axis in 0..3 {
+            ray.near_origin[axis] = group.near_origin[axis][lane];
+            ray.far_origin[axis] = group.far_origin[axis][lane];
+            ray.inverse[axis] = group.inverse[axis][lane];
+            ray.far_inverse[axis] = group.far_inverse[axis][lane];
+        }
+        ray.high = group.high[lane];
+        ray
+    }
+
+    /// A ray as flat faces want it.
+    #[inline(always)]
+    fn shear(&self, place: usize) -> Shear {
+        shear_at(&self.groups[place / LANES], place % LANES, self.axes)
+    }
+
+    /// Notes what an item has meant for a ray; whether it ended or reaches less far.
+    #[inline(always)]
+    fn take(&mut self, place: usize, step: &Step) -> bool {
+        match *step {
+            Step::Past => return false,
+            Step::On(reach) => {
+                self.groups[place / LANES].high[place % LANES] = self.turn.reach(reach);
+            }
+            Step::Enough => self.alive &= !(1 << place),
+        }
+        true
+    }
+
+    /// Finds anew how far the farthest ray reaches.
+    #[inline(always)]
+    fn shorten_beam(&mut self) {
+        let mut most = [f32::NEG_INFINITY; LANES];
+        for (k, group) in self.groups.iter().enumerate() {
+            if self.alive >> (LANES * k) & 0xFF != 0 {
+                for (most, &high) in most.iter_mut().zip(&group.high) {
+                    *most = larger(high, *most);
+                }
+            }
+        }
+        self.beam.high = most.into_iter().fold(f32::NEG_INFINITY, larger);
+    }
+
+    /// The rays of a mask meet the items of a leaf.
+    #[inline(always)]
+    fn meet_leaf(
+        &mut self,
+        kernel: impl BoxKernel,
+        view: &View<'_>,
+        (leaf, mask): (Child, u64),
+        meeting: &mut impl Meeting,
+    ) {
+        let mut is_changed = false;
+        for &item in &view.items[leaf.items()] {
+            let mask = mask & self.alive;
+            let vertices = match item.kind() {
+                Some(Kind::Triangle) => &view.triangles[item.index()].vertices,
+                Some(Kind::Coplanar) => &view.coplanars[item.index()].vertices,
+                kind => {
+                    for place in places(mask) {
+                        let shear = self.shear(place);
+                        let is_solid = kind == Some(Kind::Solid);
+                        let box_ray = if is_solid { self.box_ray(place) } else { BoxRay::NOWHERE };
+                        let step = meeting.ask(place, item, &shear, &box_ray);
+                        is_changed |= self.take(place, &step);
+                    }
+                    continue;
+                }
+            };
+            let [x, y, z] = self.axes;
+            let mut corners = [[0.0; 3]; 3];
+            for (corner, vertex) in corners.iter_mut().zip(view.corners(vertices)) {
+                *corner = [vertex[x], vertex[y], vertex[z]];
+            }
+            let met = kernel.cross(&self.groups, &corners, mask, &mut self.crossings);
+            for place in places(met.certain) {
+                let t = self.crossings[place / LANES][place % LANES];
+                let step = meeting.cross(place, item, t);
+                is_changed |= self.take(place, &step);
+            }
+            for place in places(met.possible & !met.certain) {
+                let step = meeting.ask(place, item, &self.shear(place), &BoxRay::NOWHERE);
+                is_changed |= self.take(place, &step);
+            }
+        }
+        if is_changed {
+            self.shorten_beam();
+        }
+    }
+
+    /// A ray goes on alone in a child.
+    #[inline(always)]
+    fn visit_alone(
+        &mut self,
+        kernel: impl BoxKernel,
+        view: &View<'_>,
+        (child, place): (Child, usize),
+        stack: &mut Stack,
+        meeting: &mut impl Meeting,
+    ) {
+        let (mut box_ray, shear) = (self.box_ray(place), self.shear(place));
+        let meet = |item, box_ray: &BoxRay| meeting.ask(place, item, &shear, box_ray);
+        if visit_from(kernel, view, (&mut box_ray, child), stack, || (), meet) {
+            self.alive &= !(1 << place);
+        }
+        self.groups[place / LANES].high[place % LANES] = box_ray.high;
+    }
+}
+
+/// The bits of a mask.
+#[inline(always)]
+fn places(mut mask: u64) -> impl Iterator<Item = usize> {
+    std::iter::from_fn(move || {
+        let place = mask.trailing_zeros() as usize;
+        (mask != 0).then(|| {
+            mask &= mask - 1;
+            place % MOST_RAYS
+        })
+    })
+}
+
+/// Takes a packet through the hierarchy: every ray meets the items in the leaves that it enters.
+#[inline(always)]
+pub(super) fn visit_packet(
+    kernel: impl BoxKernel,
+    view: &View<'_>,
+    packet: &mut Packet,
+    (PacketStack(stack), alone): (&mut PacketStack, &mut Stack),
+    meeting: &mut impl Meeting,
+) {
+    let mut waiting = 0;
+    let (mut current, mut mask) = (Child::ROOT, packet.alive);
+    loop {
+        if current.is_leaf() {
+            packet.meet_leaf(kernel, view, (current, mask), meeting);
+        } else if mask.count_ones() <= FEW {
+            for place in places(mask) {
+                packet.visit_alone(kernel, view, (current, place), alone, meeting);
+            }
+            packet.shorten_beam();
+        } else {
+            let node = &view.nodes[current.node()];
+            let (nears, mut met) = kernel.meet_beam(node, &packet.beam);
+            let first = waiting;
+            while met != 0 {
+                let child = met.trailing_zeros() as usize & 7;
+                met &= met - 1;
+                let planes = [packet.beam.near, packet.beam.far];
+                let [near, far] =
+                    planes.map(|[x, y, z]| [x, y, z].map(|axis: usize| node.planes[axis][child]));
+                let entering = kernel.enter(&packet.groups, [near, far], mask);
+                if entering == 0 {
+                    continue;
+                }
+                // Insert so that the nearest ends on top.
+                let mut at = waiting;
+                while at > first && stack[at - 1].0 < nears[child] {
+                    stack[at] = stack[at - 1];
+                    at -= 1;
+                }
+                stack[at] = (nears[child], node.children[child], entering);
+                waiting += 1;
+            }
+        }
+        loop {
+            if waiting == 0 {
+                return;
+            }
+            waiting -= 1;
+            let (near, child, entering) = stack[waiting];
+            (current, mask) = (child, entering & packet.alive);
+            if near <= packet.beam.high && mask != 0 {
+                break;
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use glam::DVec3;
+    use rtfarm_oracle::random::Random;
+
+    use crate::{
+        isa::Isa,
+        prepare::prepare,
+        prepared::PreparedScene,
+        scene::{Quadrangle, Scene, Sphere, Triangle, Viewport},
+        trace::probe::{Probe, Probing},
+    };
+
+    /// Triangles small and large, some of them in one plane, quadrangles and spheres.
+    fn scene(random: &mut Random) -> Scene {
+        let mut scene = Scene {
+            viewport: Some(Viewport {
+                eye: DVec3::ZERO,
+                top_left: DVec3::Z,
+                bottom_left: DVec3::Y,
+                top_right: DVec3::X,
+            }),
+            ..Scene::default()
+        };
+        let mut primitive = 0..;
+        let mut next = || primitive.next().expect("many numbers");
+        for _ in 0..2_000 {
+            let middle = random.in_cube();
+            let size = random.log_uniform(0.01, 0.5);
+            let mut corner = || {
+                let corner = middle + size * random.in_cube();
+                if random.chance(0.3) { DVec3::new(corner.x, corner.y, 0.25) } else { corner }
+            };
+            let vertices = [corner(), corner(), corner()];
+            scene.triangles.push(Triangle { vertices, material: 0, primitive: next() });
+        }
+        for _ in 0..50 {
+            let (center, radius) = (random.in_cube(), random.log_uniform(0.01, 0.2));
+            scene.spheres.push(Sphere { center, radius, material: 0, primitive: next() });
+            let [a, u, v] = [(); 3].map(|()| random.in_cube());
+            let vertices = [a, a + 0.2 * u, a + 0.2 * (u + v), a + 0.2 * v];
+            scene.quadrangles.push(Quadrangle { vertices, material: 0, primitive: next() });
+        }
+        scene.materials.push(crate::scene::Material {
+            name: String::new(),
+            color: DVec3::ONE,
+            alpha: 1.0,
+            reflect: 0.0,
+            refract: 0.0,
+            texture: None,
+        });
+        scene
+    }
+
+    #[test]
+    fn rays_of_a_packet_meet_what_each_meets_alone() {
+        let random = &mut Random::new(19);
+        let scene = scene(random);
+        let prepared = PreparedScene::open(prepare(&scene).unwrap()).unwrap();
+        let mut probes = Vec::new();
+        for _ in 0..40 {
+            let (eye, middle) = (2.0 * random.in_cube(), random.in_cube());
+            let spread = random.log_uniform(0.001, 1.0);
+            for _ in 0..60 {
+                let target = match random.below(3) {
+                    0 => scene.triangles[random.below(scene.triangles.len())].vertices[0],
+                    _ => middle + spread * random.in_cube(),
+                };
+                let origin = if random.chance(0.7) { eye } else { eye + 0.1 * random.in_cube() };
+                let direction = (target - origin).normalize();
+                probes.push(Probe { origin, direction, leaving: None });
+            }
+        }
+        let truth = prepared.probe_all_faces(&probes);
+        assert!(truth.iter().filter(|hit| hit.is_some()).count() > probes.len() / 4);
+        for isa in Isa::ALL.into_iter().filter(|isa| isa.is_supported()) {
+            assert_eq!(prepared.probe(&probes, isa), truth, "{isa}");
+            for (probe, hit) in probes.iter().zip(&truth) {
+                assert_eq!(prepared.probe(&[*probe], isa), [*hit], "{isa}: {probe:?}");
+            }
+        }
+    }
+}
