@@ -575,6 +575,7 @@ impl PictureArgs {
                 seed: self.seed,
                 flat: self.flat,
                 secondary: matches!(self.secondary, Switch::On),
+                clips: format != PictureFormat::ExrF32,
             },
             crop: self.crop,
             tile_side: self.tile,

@@ -86,7 +86,7 @@ impl TryFrom<wire::Quality> for Quality {
     type Error = WireError;
 
     fn try_from(quality: wire::Quality) -> Result<Self, WireError> {
-        let wire::Quality { sampling, seed, flat, secondary } = quality;
+        let wire::Quality { sampling, seed, flat, secondary, clips } = quality;
         let sampling = match sampling.ok_or(WireError::Missing("sampling"))? {
             wire::quality::Sampling::Samples(count) => {
                 Sampling::fixed(count).ok_or(WireError::Samples(count))?
@@ -98,13 +98,13 @@ impl TryFrom<wire::Quality> for Quality {
                 }
             }
         };
-        Ok(Self { sampling, seed, flat, secondary })
+        Ok(Self { sampling, seed, flat, secondary, clips })
     }
 }
 
 impl From<Quality> for wire::Quality {
     fn from(quality: Quality) -> Self {
-        let Quality { sampling, seed, flat, secondary } = quality;
+        let Quality { sampling, seed, flat, secondary, clips } = quality;
         let sampling = Some(match sampling {
             Sampling::Fixed(count) => wire::quality::Sampling::Samples(count.get()),
             Sampling::Adaptive { error, most } => {
@@ -112,7 +112,7 @@ impl From<Quality> for wire::Quality {
                 wire::quality::Sampling::Adaptive(wire::Adaptive { error, most })
             }
         });
-        Self { sampling, seed, flat, secondary }
+        Self { sampling, seed, flat, secondary, clips }
     }
 }
 
@@ -221,8 +221,13 @@ mod tests {
     #[test]
     fn settings_out_of_range_are_refused() {
         use wire::quality::Sampling::{Adaptive, Samples};
-        let quality =
-            wire::Quality { sampling: Some(Samples(1)), seed: 9, flat: true, secondary: false };
+        let quality = wire::Quality {
+            sampling: Some(Samples(1)),
+            seed: 9,
+            flat: true,
+            secondary: false,
+            clips: true,
+        };
         let frame = wire::Frame { width: 2, height: 3 };
         let good = wire::Settings { frame: Some(frame), quality: Some(quality) };
         let settings = Settings::try_from(good).unwrap();

@@ -47,7 +47,7 @@ fn summary(ladders: &[Ladder]) -> String {
     let mut text = String::from(
         "## How well a render tells its error\n\nTold over true: the median, and the least and the \
          most of all settings and seeds. Of an image seen from afar the filter is part of the \
-         error, and no sample shows it.\n\n| scene | fixed | adaptive |\n|---|---|---|\n",
+         error, and samples hardly show it.\n\n| scene | fixed | adaptive |\n|---|---|---|\n",
     );
     let cell = |ladders: &[Ladder], of: fn(&Ladder) -> &[Rung]| {
         let rungs = ladders.iter().flat_map(of);

@@ -166,6 +166,18 @@ const HIDDEN: f64 = 1.0 / 128.0;
 /// pixels that stay beside an edge it crosses some only.
 const CROSSED: f64 = 0.75;
 
+/// A channel is certainly above full light if its mean is by so many standard errors.
+const CERTAIN: f64 = 4.0;
+
+/// What a pixel is to come to.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Wanted {
+    /// Its standard error is to be below this in each channel.
+    pub(super) error: f64,
+    /// Channels that are certainly above this are good enough; it may be infinite.
+    pub(super) full_light: f64,
+}
+
 /// What a pixel shows of a contrast that runs evenly through its neighbourhood, as of a shade: a
 /// fourth. What is beyond that is unseen.
 const EVEN: f64 = 4.0;
@@ -219,35 +231,60 @@ impl Pixel {
     /// The mean of all samples and its variance. Of one sample the neighbourhood's first ones tell
     /// it, of more the runs, which have little part in the decision to stop: who stops where runs
     /// agree by chance is wrong, and then tells the contrary.
-    pub(super) fn estimate(&self) -> Estimate {
+    pub(super) fn estimate(&self, wanted: &Wanted) -> Estimate {
         let of_samples = if self.runs.count == 1 { self.around } else { self.runs.variance() };
         let missed = CROSSED * self.missed_variance();
-        let variance = of_samples.map(|variance| variance + missed + self.unseen);
+        let variance =
+            of_samples.map(|variance| self.unclipped(variance + missed + self.unseen, wanted));
         Estimate { mean: self.runs.mean(), variance }
     }
 
-    /// Whether the standard error is expected to be below `error` in each channel: nearly that of
+    /// Whether the standard error is expected to be small enough in each channel: nearly that of
     /// an edge with the same samples, but runs that lie far apart keep the pixel open.
-    pub(super) fn is_below(&self, error: f64) -> bool {
+    pub(super) fn is_done(&self, wanted: &Wanted) -> bool {
         let n = f64::from(self.runs.count);
         let of_samples = if self.runs.count == 1 {
             self.around
         } else {
-            let mean = self.runs.mean();
-            let variance = (self.squares / n - mean * mean).max(DVec3::ZERO) * (n / (n - 1.0));
-            let of_edge = variance * (EDGE / (n * n.sqrt()));
+            let of_edge = self.variance_of_one() * (EDGE / (n * n.sqrt()));
             self.runs.variance().map(|of_runs| of_edge.lerp(of_runs, DECISION_OF_RUNS))
         };
         of_samples.is_some_and(|variance| {
             let variance = variance + self.missed_variance() + self.unseen;
-            variance.max_element() < error * error
+            self.unclipped(variance, wanted).max_element() < wanted.error * wanted.error
         })
+    }
+
+    /// The variance of one sample, channel by channel, from how far several lie apart.
+    fn variance_of_one(&self) -> DVec3 {
+        let (mean, n) = (self.runs.mean(), f64::from(self.runs.count));
+        (self.squares / n - mean * mean).max(DVec3::ZERO) * (n / (n - 1.0))
+    }
+
+    /// `variance` of what is left of a pixel that is clipped at full light: 0 in the channels that are
+    /// certainly above it, and nowhere more than the square of full light. Samples count as if they lay
+    /// by chance, for nobody knows what follows.
+    fn unclipped(&self, variance: DVec3, wanted: &Wanted) -> DVec3 {
+        if wanted.full_light == f64::INFINITY {
+            return variance;
+        }
+        let of_samples = match self.runs.count {
+            1 => self.around.unwrap_or(DVec3::INFINITY),
+            n => self.variance_of_one() / f64::from(n),
+        };
+        let spread = of_samples + self.missed_variance() + self.unseen;
+        let least = self.runs.mean() - CERTAIN * spread.map(f64::sqrt);
+        let full_light = DVec3::splat(wanted.full_light);
+        DVec3::select(least.cmpge(full_light), DVec3::ZERO, variance.min(full_light * full_light))
     }
 
     /// Whether the first samples of the neighbourhood lie so far apart that the pixels around may
     /// hide an edge worth more samples.
-    pub(super) fn is_suspect(&self, error: f64) -> bool {
-        self.around.is_none_or(|variance| HIDDEN * variance.max_element() > error * error)
+    pub(super) fn is_suspect(&self, wanted: &Wanted) -> bool {
+        self.around.is_none_or(|variance| {
+            let variance = self.unclipped(variance, wanted);
+            HIDDEN * variance.max_element() > wanted.error * wanted.error
+        })
     }
 
     /// The variance that is added by what the neighbours met and this pixel did not yet.
@@ -281,6 +318,10 @@ mod tests {
         let mut pixel = Pixel::new(first, &Neighbourhood::new(frame(3, 3), 1, 1, &[first; 9]));
         others.into_iter().for_each(|color| pixel.add(DVec3::splat(color)));
         pixel
+    }
+
+    fn wanted(error: f64) -> Wanted {
+        Wanted { error, full_light: f64::INFINITY }
     }
 
     #[test]
@@ -318,23 +359,46 @@ mod tests {
     #[test]
     fn what_only_a_neighbour_saw_keeps_a_pixel_open() {
         let mut one = pixel(0.5, []);
-        assert!(one.is_below(1e-9) && !one.is_suspect(1e-9));
+        assert!(one.is_done(&wanted(1e-9)) && !one.is_suspect(&wanted(1e-9)));
         let seen = [[DVec3::splat(0.5); 2], [DVec3::ZERO, DVec3::splat(0.5)]];
         one.set_contrast(seen.into_iter());
-        assert!(!one.is_below(16.0 / 255.0));
+        assert!(!one.is_done(&wanted(16.0 / 255.0)));
         let mut eight = pixel(0.5, [0.5; 7]);
-        assert!(eight.is_below(1e-9));
+        assert!(eight.is_done(&wanted(1e-9)));
         eight.set_contrast(seen.into_iter());
-        assert!(!eight.is_below(1.0 / 255.0));
+        assert!(!eight.is_done(&wanted(1.0 / 255.0)));
         let mut long = pixel(0.5, [0.5; 63]);
         long.set_contrast(seen.into_iter());
-        assert!(long.is_below(1.0 / 255.0));
+        assert!(long.is_done(&wanted(1.0 / 255.0)));
     }
 
     #[test]
     fn runs_that_agree_by_chance_do_not_close_a_pixel() {
         let edge = pixel(0.0, [0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 1.0]);
-        assert_eq!(edge.estimate().variance, Some(DVec3::ZERO));
-        assert!(!edge.is_below(8.0 / 255.0));
+        assert_eq!(edge.estimate(&wanted(1.0)).variance, Some(DVec3::ZERO));
+        assert!(!edge.is_done(&wanted(8.0 / 255.0)));
+    }
+
+    #[test]
+    fn what_is_certainly_above_full_light_is_done_where_it_is_clipped() {
+        let clipped = Wanted { error: 1.0 / 255.0, full_light: 1.0 };
+        let bright = pixel(2.5, [2.0, 3.0, 2.5, 2.0, 3.0, 2.5, 2.5]);
+        assert!(bright.is_done(&clipped) && !bright.is_done(&wanted(1.0 / 255.0)));
+        assert_eq!(bright.estimate(&clipped).variance, Some(DVec3::ZERO));
+        assert!(bright.estimate(&wanted(1.0 / 255.0)).variance.unwrap().x > 0.0);
+        // Its mean is above full light, but may not stay so.
+        let doubtful = pixel(0.0, [3.0, 0.0, 3.0, 0.0, 3.0, 0.0, 3.0]);
+        assert!(!doubtful.is_done(&clipped));
+        // One channel is not.
+        let mut yellow = bright;
+        for _ in 0..2 {
+            yellow.add(DVec3::new(2.5, 2.5, 0.0));
+        }
+        assert!(!yellow.is_done(&clipped));
+        // What the neighbours saw may be in it too.
+        let mut beside = pixel(1.2, []);
+        assert!(beside.is_done(&clipped));
+        beside.set_contrast([[DVec3::ZERO, DVec3::splat(1.2)]].into_iter());
+        assert!(!beside.is_done(&clipped));
     }
 }

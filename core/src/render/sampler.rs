@@ -5,7 +5,7 @@ use std::ops::{ControlFlow, Range};
 use glam::DVec3;
 
 use super::{
-    pixel::{Estimate, Neighbourhood, Pixel, Runs},
+    pixel::{Estimate, Neighbourhood, Pixel, Runs, Wanted},
     settings::{Quality, Sampling},
     tally::Tally,
     unseen::{FirstSample, UnseenFaces, UnseenSearch},
@@ -60,7 +60,9 @@ impl<'a> Sampler<'a> {
         match self.quality.sampling {
             Sampling::Fixed(count) => self.sample_evenly(area, count.get()),
             Sampling::Adaptive { error, most } => {
-                self.sample_as_needed(area, error.get(), most.get())
+                let full_light = if self.quality.clips { 1.0 } else { f64::INFINITY };
+                let wanted = Wanted { error: error.get(), full_light };
+                self.sample_as_needed(area, &wanted, most.get())
             }
         }
     }
@@ -75,12 +77,11 @@ impl<'a> Sampler<'a> {
         ControlFlow::Continue(pixels.iter().map(Runs::estimate).collect())
     }
 
-    /// The pixels of `area` with samples until each one's standard error is below `error`: one each
-    /// at first, more where the neighbourhood's samples or the faces in the beam ask for them.
+    /// The pixels of `area` with samples until each one is what is wanted: one each at first, more where the neighbourhood's samples or the faces in the beam ask for them.
     fn sample_as_needed(
         &mut self,
         area: Area,
-        error: f64,
+        wanted: &Wanted,
         most: u32,
     ) -> ControlFlow<(), Vec<Estimate>> {
         let near = area.with_rim();
@@ -104,7 +105,7 @@ impl<'a> Sampler<'a> {
             hits[pixel as usize] = hit;
         }
         let (flat, seed) = (self.quality.flat, self.quality.seed);
-        let mut search = UnseenSearch::new(self.view, area.frame(), flat, error, self.isa);
+        let mut search = UnseenSearch::new(self.view, area.frame(), flat, wanted.error, self.isa);
         let found = match &mut search {
             Some(search) => self.find_unseen(search, area, wide, &colors, &hits)?,
             None => Vec::new(),
@@ -121,8 +122,8 @@ impl<'a> Sampler<'a> {
         drop(colors);
         let is_open = |&(x, y): &(u32, u32)| {
             let mut around = neighbours(far, x, y).map(|index| &pixels[index as usize]);
-            !pixels[far.index_of(x, y) as usize].is_below(error)
-                || around.any(|pixel| pixel.is_suspect(error))
+            !pixels[far.index_of(x, y) as usize].is_done(wanted)
+                || around.any(|pixel| pixel.is_suspect(wanted))
         };
         let chosen: Vec<u32> =
             near.pixels().filter(is_open).map(|(x, y)| far.index_of(x, y)).collect();
@@ -139,8 +140,8 @@ impl<'a> Sampler<'a> {
             let unseen = found.next_if(|&(at, _)| at == index).map(|(_, unseen)| unseen);
             let mut pixel = OpenPixel { index, pixel, unseen };
             pixel.note_samples(search.as_ref(), area, seed, 1);
-            estimates.push(pixel.pixel.estimate());
-            if !pixel.pixel.is_below(error) {
+            estimates.push(pixel.pixel.estimate(wanted));
+            if !pixel.pixel.is_done(wanted) {
                 open.push(pixel);
             }
         }
@@ -157,9 +158,9 @@ impl<'a> Sampler<'a> {
             })?;
             for open in behind {
                 open.note_samples(search.as_ref(), area, seed, count);
-                estimates[open.index as usize] = open.pixel.estimate();
+                estimates[open.index as usize] = open.pixel.estimate(wanted);
             }
-            open.retain(|open| !open.pixel.is_below(error));
+            open.retain(|open| !open.pixel.is_done(wanted));
             count = next;
         }
         self.tally.capped += open.len() as u64;

@@ -27,13 +27,16 @@ pub struct Quality {
     pub flat: bool,
     /// Surfaces that mirror light others.
     pub secondary: bool,
+    /// More than full light is worth no more: who keeps the picture clips it. Adaptive pixels that are
+    /// certainly above it get no more samples, and have no error there.
+    pub clips: bool,
 }
 
 impl Default for Quality {
     fn default() -> Self {
         let (error, most) = (StandardError::EIGHT_BIT_STEP, SampleLimit::DEFAULT);
         let sampling = Sampling::Adaptive { error, most };
-        Self { sampling, seed: 0, flat: false, secondary: true }
+        Self { sampling, seed: 0, flat: false, secondary: true, clips: false }
     }
 }
 

@@ -81,6 +81,9 @@ mod tests {
             let faces = std::array::from_fn(|face| PlaneIndex::new(face, face % 2 == 0));
             let planes = BoxPlanes::new(faces, &planes);
             let toward = point(random) * [1.0, 0.0][random.below(2)] + edges[random.below(3)];
+            if toward == DVec3::ZERO {
+                continue;
+            }
             let ray = Ray {
                 origin: point(random),
                 direction: toward / toward.length(),

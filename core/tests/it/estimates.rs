@@ -145,6 +145,43 @@ fn adaptive_samples_take_a_third_of_the_rays_where_there_are_edges() {
     }
 }
 
+#[test]
+fn what_the_file_clips_gets_no_more_samples() {
+    // A lamp that is much too bright, and balls that shade each other.
+    let text = "viewport origin 0 0 5 topleft -2 1.5 0 bottomleft -2 -1.5 0 topright 2 1.5 0
+        endviewport materials entry name a endentry entry name m reflect 0.5 endentry endmaterials
+        lights reference power 100 distance 6 endreference
+            point coords 3 4 6 color 255 255 100 power 900 endpoint endlights
+        geometry quadrangle vertex -9 -9 -2 vertex 9 -9 -2 vertex 9 9 -2 vertex -9 9 -2 material a
+            endquadrangle sphere coords -0.5 0 0 radius 0.6 material m endsphere
+            sphere coords 0.8 0.4 0.4 radius 0.5 material a endsphere endgeometry";
+    let scene = prepared(&read(text));
+    let size = Size::new(96, 72).unwrap();
+    let picture = |sampling, clips| {
+        let quality = Quality { sampling, clips, ..Quality::default() };
+        let go_on = &mut || ControlFlow::Continue(());
+        render_tile(&scene, &quality, whole(size), Isa::fastest(), go_on).unwrap()
+    };
+    let truth = picture(Sampling::fixed(1024).unwrap(), false);
+    let clip = |tile: &RenderedTile| -> Vec<f64> {
+        tile.pixels.as_flattened().iter().map(|&c| f64::from(c).min(1.0)).collect()
+    };
+    let truth = clip(&truth);
+    let [plain, clipped] = [false, true].map(|clips| {
+        let tile = picture(adaptive(1.0), clips);
+        let off = clip(&tile).iter().zip(&truth).map(|(a, b)| (a - b) * (a - b)).sum::<f64>();
+        let (true_error, told) = ((off / truth.len() as f64).sqrt(), tile.tally.error().unwrap());
+        eprintln!(
+            "clips {clips}: {} samples, {true_error:.1e}, told {told:.1e}",
+            tile.tally.samples
+        );
+        (tile.tally.samples, true_error, told)
+    });
+    assert!(clipped.0 * 4 < plain.0 * 3, "{} of {}", clipped.0, plain.0);
+    assert!(clipped.1 < 1.0 / 255.0 && clipped.1 < 1.25 * plain.1, "{} {}", clipped.1, plain.1);
+    assert!((0.5..2.0).contains(&(clipped.2 / clipped.1)), "{} {}", clipped.2, clipped.1);
+}
+
 /// Upright wires of that width in pixels, every fourth column, in a picture of 96 x 72: how much
 /// of their light the adaptive picture and one of 64 samples lack.
 fn missing_light(width: f64) -> [f64; 2] {

@@ -193,7 +193,7 @@ impl<'a> OnwardSearch<'a> {
         if on_light.contains(&stage.surface) || !stage.sheet.is_before(position) {
             return;
         }
-        let Some(screen) = stage.screen.seen_from_light(&stage.sheet, position) else { return };
+        let Some(screen) = stage.screen.seen_by_light(&stage.sheet, position) else { return };
         let ends_here = |face: &Outline| {
             let surface = face.face.surface(self.view);
             surface == stage.surface || on_light.contains(&surface)

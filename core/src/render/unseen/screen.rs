@@ -42,7 +42,7 @@ impl Screen {
 
     /// The same pixels of a flat surface as a light at `position` sees them: places and the surface's
     /// depths are those on this screen.
-    pub(super) fn seen_from_light(&self, sheet: &Sheet, position: DVec3) -> Option<Self> {
+    pub(super) fn seen_by_light(&self, sheet: &Sheet, position: DVec3) -> Option<Self> {
         let away = self.eye - position;
         let axes = [0, 1, 2].map(|k| self.axes[k] + sheet.inverse_depth[k] * away);
         Self::with_axes(position, axes)
