@@ -15,7 +15,8 @@ use anyhow::Context;
 use rtfarm_core::{render::Tally, tile::Size};
 use rtfarm_job::Progress;
 use rtfarm_proto::{
-    Address, Bytes, CHUNK_BYTES, JobId, MESSAGE_BYTES, PROTOCOL, WireError,
+    Access, Bytes, CHUNK_BYTES, ConnectError, Connection, JobId, MESSAGE_BYTES, PROTOCOL,
+    WireError,
     wire::{self, event, jobs_client::JobsClient, submit_request::Part, submit_response},
 };
 use serde_json::json;
@@ -26,7 +27,7 @@ use tokio::{
 };
 use tokio_stream::wrappers::ReceiverStream;
 use tokio_util::sync::CancellationToken;
-use tonic::{Code, Status, Streaming, transport::Channel};
+use tonic::{Code, Status, Streaming};
 
 use crate::{
     VERSION,
@@ -53,7 +54,8 @@ pub(crate) async fn run(
     let mut output = args.picture.output().map_err(Failure::Input)?;
     output.check()?;
     let text = SceneText::read(&args.picture.scene, stop).await?;
-    let (scene, coordinator) = (args.picture.scene.name(), args.coordinator.clone());
+    let access = args.coordinator.access().map_err(Failure::Input)?;
+    let (scene, coordinator) = (args.picture.scene.name(), access.address().clone());
     let mut submission = Submission::new(scene, coordinator, args.patience, args.detach, now());
     let key = match &args.key {
         Some(key) => key.clone(),
@@ -61,6 +63,7 @@ pub(crate) async fn run(
     };
     let mut shell = Shell {
         args: &args,
+        access,
         output: &output,
         console,
         stop,
@@ -134,13 +137,14 @@ async fn sleep_until(moment: Option<std::time::Instant>) {
 /// What is being done, and what it needs.
 struct Shell<'a> {
     args: &'a SubmitArgs,
+    access: Access,
     output: &'a Output,
     console: &'a Console,
     stop: &'a CancellationToken,
     /// Tells the order from every other, though it may be sent again.
     key: String,
     text: Arc<SceneText>,
-    client: Option<JobsClient<Channel>>,
+    client: Option<JobsClient<Connection>>,
     /// The id of the farm that took the order.
     farm: Bytes,
     /// What the running task tells.
@@ -153,7 +157,7 @@ struct Shell<'a> {
 
 /// What a task tells.
 enum Report {
-    Connected(JobsClient<Channel>),
+    Connected(JobsClient<Connection>),
     Submitted(Submitted, Bytes),
     Watching,
     JobState(JobState),
@@ -200,8 +204,8 @@ impl Shell<'_> {
     fn execute(&mut self, action: Action) -> ControlFlow<Result<Ended, Failure>> {
         match action {
             Action::Connect => {
-                let address = self.args.coordinator.clone();
-                self.start(|reports| connect(address, reports));
+                let access = self.access.clone();
+                self.start(|reports| connect(access, reports));
             }
             Action::Submit => {
                 let order = self.order();
@@ -318,7 +322,7 @@ impl Shell<'_> {
         }
     }
 
-    fn client(&self) -> JobsClient<Channel> {
+    fn client(&self) -> JobsClient<Connection> {
         self.client.clone().expect("a submission connects first")
     }
 
@@ -368,23 +372,24 @@ pub(crate) fn is_lost(status: &Status) -> bool {
 }
 
 /// Reaches a coordinator.
-pub(crate) async fn reach(
-    address: &Address,
-) -> Result<JobsClient<Channel>, tonic::transport::Error> {
-    let client = JobsClient::new(address.connect().await?);
+pub(crate) async fn reach(access: &Access) -> Result<JobsClient<Connection>, ConnectError> {
+    let client = JobsClient::new(access.connect().await?);
     Ok(client.max_decoding_message_size(MESSAGE_BYTES).max_encoding_message_size(MESSAGE_BYTES))
 }
 
-async fn connect(address: Address, reports: mpsc::Sender<Report>) {
-    let report = match reach(&address).await.map_err(anyhow::Error::from) {
+async fn connect(access: Access, reports: mpsc::Sender<Report>) {
+    let report = match reach(&access).await.map_err(anyhow::Error::from) {
         Ok(client) => Report::Connected(client),
-        Err(error) => Report::Trouble(Trouble::Connect(address, format!("{error:#}"))),
+        Err(error) => {
+            let address = access.address().clone();
+            Report::Trouble(Trouble::Connect(address, format!("{error:#}")))
+        }
     };
     let _ = reports.send(report).await;
 }
 
 async fn submit(
-    mut client: JobsClient<Channel>,
+    mut client: JobsClient<Connection>,
     order: wire::Order,
     text: Arc<SceneText>,
     files: BTreeMap<String, Vec<u8>>,
@@ -418,7 +423,7 @@ async fn submit(
 
 /// Tells of a job until there is nothing more to tell.
 async fn watch(
-    mut client: JobsClient<Channel>,
+    mut client: JobsClient<Connection>,
     request: wire::WatchRequest,
     reports: mpsc::Sender<Report>,
 ) {
@@ -449,7 +454,7 @@ async fn tell_events(mut events: Streaming<wire::Event>, reports: &mpsc::Sender<
 
 /// Brings a finished job's picture and hands it on, piece by piece.
 async fn fetch(
-    mut client: JobsClient<Channel>,
+    mut client: JobsClient<Connection>,
     request: wire::ImageRequest,
     send: mpsc::Sender<wire::Chunk>,
     reports: mpsc::Sender<Report>,

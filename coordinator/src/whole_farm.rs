@@ -26,7 +26,7 @@ use rtfarm_core::{
 use rtfarm_job::{Order, RenderRequest};
 use rtfarm_picture::{Disk, Picture, PictureFormat};
 use rtfarm_proto::{
-    Address, Bytes, JobId, PROTOCOL,
+    Access, Address, Bytes, JobId, PROTOCOL,
     wire::{
         self, Verdict, event::End, jobs_client::JobsClient, lease_response, submit_request::Part,
         submit_response::Outcome,
@@ -582,7 +582,7 @@ struct Surroundings {
 impl Outside for Surroundings {
     type Connection = Net;
 
-    async fn connect(&self, _: &Address) -> Result<Net, String> {
+    async fn connect(&self, _: &Access) -> Result<Net, String> {
         self.net.hop().await.map_err(|error| error.to_string())?;
         self.net.world.current().map(|_| self.net.clone()).ok_or_else(|| "refused".to_owned())
     }
@@ -637,7 +637,7 @@ impl World {
         loop {
             let Host { threads, is_liar, .. } = self.hosts[host];
             let config = rtfarm_worker::Config {
-                coordinator: Address::Tcp("coordinator:1".to_owned()),
+                coordinator: Address::Tcp("coordinator:1".to_owned()).into(),
                 threads,
                 isa: Isa::Scalar,
                 version: "1".to_owned(),

@@ -3,9 +3,9 @@
 use std::{error::Error, panic::resume_unwind};
 
 use rayon::{ThreadPool, ThreadPoolBuildError, ThreadPoolBuilder};
-use rtfarm_proto::Address;
+use rtfarm_proto::{Access, Connection as Reached};
 use tokio::time::Instant;
-use tonic::{body::Body, client::GrpcService, transport::Channel};
+use tonic::{body::Body, client::GrpcService};
 
 /// A connection to a coordinator. A clone is the same connection.
 pub trait Connection:
@@ -23,10 +23,10 @@ pub trait Outside: Send + Sync + 'static {
     /// Reaches a coordinator.
     type Connection: Connection;
 
-    /// Reaches the coordinator at an address, or says why it cannot.
+    /// Reaches a coordinator, or says why it cannot.
     fn connect(
         &self,
-        address: &Address,
+        access: &Access,
     ) -> impl Future<Output = Result<Self::Connection, String>> + Send;
 
     /// Hands work to the threads, which begin what came earlier first, and tell it when it begins.
@@ -55,10 +55,10 @@ impl Machine {
 }
 
 impl Outside for Machine {
-    type Connection = Channel;
+    type Connection = Reached;
 
-    async fn connect(&self, address: &Address) -> Result<Channel, String> {
-        address.connect().await.map_err(|error| {
+    async fn connect(&self, access: &Access) -> Result<Reached, String> {
+        access.connect().await.map_err(|error| {
             let mut reason: &dyn Error = &error;
             while let Some(source) = reason.source() {
                 reason = source;
