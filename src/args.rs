@@ -1,11 +1,17 @@
 //! The command line's words.
 
-use std::{fmt, ops::RangeInclusive, path::PathBuf, str::FromStr, time::Duration};
+use std::{
+    fmt, fs, ops::RangeInclusive, os::unix::fs::PermissionsExt, path::PathBuf, str::FromStr,
+    time::Duration,
+};
+
+use anyhow::{Context, ensure};
 
 use clap::{
     Args as ClapArgs, Parser, Subcommand, ValueEnum, builder::NonEmptyStringValueParser,
     value_parser,
 };
+use rtfarm_coordinator::{Limits, Role};
 use rtfarm_core::{
     isa::{Isa, IsaError},
     render::{Quality, SampleCount, SampleLimit, Sampling, StandardError},
@@ -15,7 +21,7 @@ use rtfarm_core::{
 use rtfarm_job::RenderRequest;
 use rtfarm_ladder::Effort;
 use rtfarm_picture::PictureFormat;
-use rtfarm_proto::Address;
+use rtfarm_proto::{Access, Address};
 
 use crate::{frames::FrameRange, output::Output};
 
@@ -39,8 +45,8 @@ const AFTER_HELP: &str = "\
 Examples:
   rtfarm render scenes/gnome.rt -o gnome.png
   rtfarm coordinator --state farm &
-  rtfarm worker --coordinator http://127.0.0.1:7878 &
-  rtfarm submit scenes/gnome.rt -o gnome.png --coordinator http://127.0.0.1:7878
+  rtfarm worker --access farm/access/work &
+  rtfarm submit scenes/gnome.rt -o gnome.png --access farm/access/submit
 
 Exit codes: 0 done, 1 failed, 2 the scene or the command line is wrong, 130 stopped by a signal.
 Options that say what they are from the environment ([env: ...]) may be given there.";
@@ -53,6 +59,9 @@ const FARM: &str = "The farm";
 
 /// Options that say what the picture is like.
 const PICTURE: &str = "The picture";
+
+/// Options that say who is let in.
+const LIMITS: &str = "Who is let in";
 
 /// Options that say who renders.
 const WORK: &str = "The work";
@@ -91,6 +100,8 @@ pub(crate) enum Command {
     Disable(StationArgs),
     /// Give tiles again to a worker that was disabled or is drained.
     Enable(StationArgs),
+    /// Renew or revoke a token of a farm; its coordinator need not be stopped.
+    Tokens(TokensArgs),
     /// Say what is wrong with a scene, and what it needs.
     Check(CheckArgs),
     /// Write a shell's completions to standard output.
@@ -138,6 +149,30 @@ pub(crate) struct CheckArgs {
     /// Answer in JSON.
     #[arg(long, help_heading = TALK)]
     pub(crate) json: bool,
+}
+
+#[derive(Debug, ClapArgs)]
+pub(crate) struct TokensArgs {
+    /// Renew makes a new token and access file, and the old one is not taken any more; revoke only that.
+    #[arg(value_name = "renew|revoke")]
+    pub(crate) change: TokenChange,
+
+    /// The role whose token it is: submit, work, read or admin.
+    #[arg(value_name = "ROLE")]
+    pub(crate) role: Role,
+
+    /// The folder of the farm's state.
+    #[arg(long, value_name = "DIR", env = "RTFARM_STATE")]
+    pub(crate) state: PathBuf,
+}
+
+/// What is done about a token.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub(crate) enum TokenChange {
+    /// It gets a successor.
+    Renew,
+    /// It is not taken any more.
+    Revoke,
 }
 
 #[derive(Debug, ClapArgs)]
@@ -299,22 +334,45 @@ pub(crate) struct RenderArgs {
 
 #[derive(Debug, ClapArgs)]
 pub(crate) struct CoordinatorArgs {
-    /// The address and port to listen on; port 0 takes a free one.
+    /// The address and port to listen on, or `unix:/folder/socket`; port 0 takes a free one.
     #[arg(long, value_name = "ADDR:PORT", default_value = "127.0.0.1:7878", env = "RTFARM_LISTEN")]
     pub(crate) listen: String,
 
-    /// Listen to other machines though nothing is encrypted and nobody is asked for a token.
+    /// Encrypt nothing and ask nobody for a token.
     #[arg(long, env = "RTFARM_INSECURE")]
     pub(crate) insecure: bool,
 
     /// Keep the farm's jobs and pictures in this folder, which is made if there is none: a coordinator
     /// that is started on it again goes on with them. Without it they end with the coordinator.
+    ///
+    /// DIR/access has the farm's certificates, and an access file for each role.
     #[arg(long, value_name = "DIR", env = "RTFARM_STATE")]
     pub(crate) state: Option<PathBuf>,
 
     /// Lose no finished tile in a power cut; otherwise those of the last second may be rendered again.
     #[arg(long, requires = "state", env = "RTFARM_DURABLE")]
     pub(crate) durable: bool,
+
+    /// Where others find the coordinator, for the access files; by default this machine's name, or the
+    /// address that is listened on.
+    #[arg(long, value_name = "HOST", env = "RTFARM_NAME", help_heading = LIMITS)]
+    pub(crate) name: Option<String>,
+
+    /// The longest that a TLS handshake may take.
+    #[arg(long, value_name = "S", default_value = "5", value_parser = parse_seconds, env = "RTFARM_HANDSHAKE_SECONDS", help_heading = LIMITS)]
+    handshake_seconds: Duration,
+
+    /// Who connects must have shown a token after so long.
+    #[arg(long, value_name = "S", default_value = "10", value_parser = parse_seconds, env = "RTFARM_GREETING_SECONDS", help_heading = LIMITS)]
+    greeting_seconds: Duration,
+
+    /// The most connections on which nobody has shown a token yet.
+    #[arg(long, value_name = "N", default_value = "64", value_parser = value_parser!(u16).range(1..), env = "RTFARM_STRANGERS", help_heading = LIMITS)]
+    strangers: u16,
+
+    /// A client that sends nothing of its scene for this long is given up.
+    #[arg(long, value_name = "S", default_value = "30", value_parser = parse_seconds, env = "RTFARM_UPLOAD_SECONDS", help_heading = LIMITS)]
+    pub(crate) upload_seconds: Duration,
 
     /// A worker that makes no progress for this long loses its tiles to others.
     #[arg(long, value_name = "S", default_value = "4", value_parser = parse_seconds, env = "RTFARM_LEASE_SECONDS", help_heading = WORK)]
@@ -340,9 +398,8 @@ pub(crate) struct CoordinatorArgs {
 
 #[derive(Debug, ClapArgs)]
 pub(crate) struct WorkerArgs {
-    /// Where the coordinator is: `http://host:7878` or `unix:/path/socket`.
-    #[arg(long, value_name = "URL", env = "RTFARM_COORDINATOR", help_heading = FARM)]
-    pub(crate) coordinator: Address,
+    #[command(flatten)]
+    pub(crate) coordinator: AccessArgs,
 
     /// Threads; all cores by default.
     #[arg(long, value_name = "N", value_parser = value_parser!(u16).range(1..=1024), env = "RTFARM_THREADS", help_heading = WORK)]
@@ -384,9 +441,8 @@ pub(crate) struct SubmitArgs {
     #[command(flatten)]
     pub(crate) picture: PictureArgs,
 
-    /// Where the coordinator is: `http://host:7878` or `unix:/path/socket`.
-    #[arg(long, value_name = "URL", env = "RTFARM_COORDINATOR", help_heading = FARM)]
-    pub(crate) coordinator: Address,
+    #[command(flatten)]
+    pub(crate) coordinator: AccessArgs,
 
     /// Print the job's number and end: the job goes on by itself, and `rtfarm image` fetches what -o
     /// says. Otherwise an interruption cancels it.
@@ -426,12 +482,52 @@ pub(crate) struct SubmitArgs {
     pub(crate) log_format: LogFormat,
 }
 
+/// Which farm is meant, and how it is reached.
+#[derive(Debug, Clone, ClapArgs)]
+pub(crate) struct AccessArgs {
+    /// Where the coordinator is: `https://host:7878` or `unix:/path/socket`, `http://` if it is insecure;
+    /// by default where the access file says.
+    #[arg(long = "coordinator", value_name = "URL", env = "RTFARM_COORDINATOR", help_heading = FARM)]
+    address: Option<Address>,
+
+    /// The access file, which says where the coordinator is, who vouches for it, and what it is shown.
+    #[arg(long, value_name = "FILE", env = "RTFARM_ACCESS", help_heading = FARM)]
+    access: Option<PathBuf>,
+}
+
+impl AccessArgs {
+    /// How the coordinator is reached. Reads the access file.
+    pub(crate) fn access(&self) -> anyhow::Result<Access> {
+        let address = self.address.clone();
+        // Where nobody is asked for a token none is read.
+        if let Some(address @ (Address::Unix(_) | Address::Tcp(_))) = address {
+            return Ok(address.into());
+        }
+        let Some(path) = &self.access else {
+            return address.map(Access::from).context(
+                "which farm is meant? --access FILE names its access file, or --coordinator URL says \
+                 where it is",
+            );
+        };
+        let read = || -> anyhow::Result<Access> {
+            let for_others = fs::metadata(path)?.permissions().mode() & 0o077;
+            ensure!(for_others == 0, "others may read it; chmod 600 makes it yours alone");
+            Ok(Access::read(&fs::read_to_string(path)?)?)
+        };
+        let access =
+            read().with_context(|| format!("cannot use the access file {}", path.display()))?;
+        Ok(match address {
+            Some(address) => access.at(address),
+            None => access,
+        })
+    }
+}
+
 /// Which farm is asked, and how it is told.
 #[derive(Debug, ClapArgs)]
 pub(crate) struct FarmArgs {
-    /// Where the coordinator is: `http://host:7878` or `unix:/path/socket`.
-    #[arg(long, value_name = "URL", env = "RTFARM_COORDINATOR", help_heading = FARM)]
-    pub(crate) coordinator: Address,
+    #[command(flatten)]
+    pub(crate) coordinator: AccessArgs,
 
     /// Answer in JSON.
     #[arg(long, help_heading = TALK)]
@@ -504,9 +600,8 @@ pub(crate) struct ImageArgs {
     #[arg(short, long, value_name = "FILE")]
     pub(crate) output: PathBuf,
 
-    /// Where the coordinator is: `http://host:7878` or `unix:/path/socket`.
-    #[arg(long, value_name = "URL", env = "RTFARM_COORDINATOR", help_heading = FARM)]
-    pub(crate) coordinator: Address,
+    #[command(flatten)]
+    pub(crate) coordinator: AccessArgs,
 }
 
 /// Yes or no.
@@ -592,6 +687,14 @@ impl RenderArgs {
         let workers = self.workers.map_or(cores.min(2), usize::from);
         let threads = self.threads.map_or((cores / workers.max(1)).max(1), usize::from);
         (workers, threads)
+    }
+}
+
+impl CoordinatorArgs {
+    /// How connections of strangers are limited.
+    pub(crate) fn limits(&self) -> Limits {
+        let (handshake, first_word) = (self.handshake_seconds, self.greeting_seconds);
+        Limits { handshake, first_word, strangers: self.strangers.into() }
     }
 }
 

@@ -1,22 +1,33 @@
 //! `rtfarm coordinator`: a farm that stays up.
 
 use std::{
-    env,
+    env, fs,
     io::{self, Write},
+    net::SocketAddr,
+    os::unix::fs::MetadataExt,
     path::PathBuf,
     time::Duration,
 };
 
 use anyhow::{Context, anyhow};
 use rtfarm_coordinator::{
-    Config, Coordinator, Durability, Keeping, Listener, StateError, StateFolder,
+    Config, Coordinator, Durability, Keeping, Listener, Security, StateError, StateFolder,
+    renew_token, revoke_token,
 };
 use rtfarm_core::isa::Isa;
-use tokio::{net::lookup_host, task::spawn_blocking};
+use rtfarm_proto::Address;
+use tokio::{
+    net::{UnixListener, lookup_host},
+    task::spawn_blocking,
+};
 use tokio_util::sync::CancellationToken;
 
 use crate::{
-    BUILD, VERSION, args::CoordinatorArgs, failure::Failure, private_folder::PrivateFolder,
+    BUILD, VERSION,
+    args::{CoordinatorArgs, TokenChange, TokensArgs},
+    failure::Failure,
+    output::folder_of,
+    private_folder::PrivateFolder,
 };
 
 /// A client that sends nothing of its scene for this long is given up.
@@ -27,17 +38,7 @@ pub(crate) async fn run(
     stop: &CancellationToken,
     terminate: &CancellationToken,
 ) -> Result<(), Failure> {
-    let listen = &args.listen;
-    let mut addresses = lookup_host(listen).await.map_err(|error| {
-        Failure::Input(anyhow!("`{listen}` is no address to listen on: {error}"))
-    })?;
-    let address = addresses.next().with_context(|| format!("`{listen}` has no address"))?;
-    if !address.ip().is_loopback() && !args.insecure {
-        return Err(Failure::Input(anyhow!(
-            "{address} is open to other machines, and TLS and tokens are still to come; \
-             --insecure listens there all the same"
-        )));
-    }
+    let place = Place::find(&args).await?;
     let state = match args.state.clone() {
         Some(path) => Some(open_state(path, args.durable).await?),
         None => None,
@@ -45,9 +46,8 @@ pub(crate) async fn run(
     let private = args.state.is_none().then(|| PrivateFolder::new(&env::temp_dir())).transpose()?;
     let folder = private.as_ref().map(PrivateFolder::path).or(args.state.as_deref());
     let folder = folder.expect("one of them is there").to_owned();
-    let listener = rtfarm_coordinator::listen(address)
-        .with_context(|| format!("cannot listen on {address}"))?;
-    writeln!(io::stdout().lock(), "listening on http://{}", listener.local_addr()?)
+    let (listener, address) = place.listen(&args)?;
+    writeln!(io::stdout().lock(), "listening on {address}")
         .context("cannot write to standard output")?;
 
     let config = Config {
@@ -60,7 +60,7 @@ pub(crate) async fn run(
             time: Duration::from_secs(u64::from(args.keep_hours) * 3600),
             byte_count: u64::from(args.keep_gb) * 1_000_000_000,
         },
-        upload_silence: UPLOAD_SILENCE,
+        upload_silence: args.upload_seconds,
         scene_folder: folder.clone(),
         picture_folder: folder,
     };
@@ -68,8 +68,100 @@ pub(crate) async fn run(
         Some(state) => Coordinator::with_state(config, state)?,
         None => Coordinator::new(config)?,
     };
-    coordinator.run(Listener::Tcp(listener), stop.cancelled()).await?;
+    coordinator.run(listener, stop.cancelled()).await?;
     if terminate.is_cancelled() { Ok(()) } else { Err(Failure::Interrupted) }
+}
+
+/// Where a coordinator may listen.
+enum Place {
+    /// In a folder that is nobody else's.
+    Unix(PathBuf),
+    Tcp(SocketAddr),
+}
+
+impl Place {
+    /// Finds out where to listen, and refuses what others could use who should not.
+    async fn find(args: &CoordinatorArgs) -> Result<Self, Failure> {
+        let listen = &args.listen;
+        if let Ok(Address::Unix(socket)) = listen.parse() {
+            let folder = folder_of(&socket);
+            let metadata = fs::metadata(&folder)
+                .with_context(|| format!("cannot listen in {}", folder.display()))?;
+            let is_ours = metadata.uid() == rustix::process::geteuid().as_raw();
+            if !is_ours || metadata.mode() & 0o077 != 0 {
+                return Err(Failure::Input(anyhow!(
+                    "others may enter {folder}; a socket needs a folder that is yours alone, with \
+                     mode 0700",
+                    folder = folder.display()
+                )));
+            }
+            return Ok(Self::Unix(socket));
+        }
+        let mut addresses = lookup_host(listen).await.map_err(|error| {
+            Failure::Input(anyhow!("`{listen}` is no address to listen on: {error}"))
+        })?;
+        let address = addresses.next().with_context(|| format!("`{listen}` has no address"))?;
+        if args.state.is_none() && !args.insecure {
+            return Err(Failure::Input(anyhow!(
+                "{address} is open to others: --state DIR keeps certificates and tokens for those who \
+                 may come, --listen unix:/folder/socket is for this user alone, and --insecure asks \
+                 nobody for anything"
+            )));
+        }
+        Ok(Self::Tcp(address))
+    }
+
+    /// Listens; answers also with the address for others.
+    fn listen(self, args: &CoordinatorArgs) -> Result<(Listener, Address), Failure> {
+        let address = match self {
+            Self::Tcp(address) => address,
+            Self::Unix(socket) => {
+                let in_place = || format!("cannot listen on {}", socket.display());
+                // What a killed coordinator left; one that lives is not there, with its state.
+                if std::os::unix::net::UnixStream::connect(&socket).is_err() {
+                    let _ = fs::remove_file(&socket);
+                }
+                let listener = UnixListener::bind(&socket).with_context(in_place)?;
+                return Ok((Listener::Unix(listener), Address::Unix(socket)));
+            }
+        };
+        let listener = rtfarm_coordinator::listen(address)
+            .with_context(|| format!("cannot listen on {address}"))?;
+        let address = listener.local_addr()?;
+        let Some(state) = args.state.as_deref().filter(|_| !args.insecure) else {
+            tracing::warn!("nothing is encrypted, and whoever reaches {address} may use the farm");
+            return Ok((Listener::Tcp(listener), Address::Tcp(address.to_string())));
+        };
+        let host = match &args.name {
+            Some(name) => name.clone(),
+            None if address.ip().is_unspecified() => {
+                rustix::system::uname().nodename().to_string_lossy().into_owned()
+            }
+            None if address.is_ipv6() => format!("[{}]", address.ip()),
+            None => address.ip().to_string(),
+        };
+        let shown = Address::Tls(format!("{host}:{}", address.port()));
+        let security = Security::open(state, &shown).map_err(anyhow::Error::from)?;
+        tracing::info!(folder = %state.join("access").display(), "access files are there");
+        Ok((Listener::Tls(listener, security, args.limits()), shown))
+    }
+}
+
+/// `rtfarm tokens`.
+pub(crate) fn change_tokens(args: &TokensArgs) -> Result<(), Failure> {
+    let TokensArgs { change, role, state } = args;
+    let told = match change {
+        TokenChange::Renew => {
+            let path = renew_token(state, *role).map_err(anyhow::Error::from)?;
+            path.display().to_string()
+        }
+        TokenChange::Revoke => {
+            revoke_token(state, *role).map_err(anyhow::Error::from)?;
+            format!("nobody has a token to {role} any more")
+        }
+    };
+    writeln!(io::stdout().lock(), "{told}").context("cannot write to standard output")?;
+    Ok(())
 }
 
 /// Opens the state in a folder, which reads the pictures under way there.

@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use rtfarm_proto::wire;
+use rtfarm_proto::{Access, wire};
 use tokio::{sync::mpsc, task::spawn_blocking, time::timeout};
 use tokio_util::sync::CancellationToken;
 
@@ -26,13 +26,14 @@ const CHUNK_DEADLINE: Duration = Duration::from_secs(30);
 pub(crate) async fn run(args: ImageArgs, stop: &CancellationToken) -> Result<(), Failure> {
     let mut output = Output::new(&args.output, None).map_err(Failure::Input)?;
     output.check()?;
+    let access = args.coordinator.access().map_err(Failure::Input)?;
     let (send, mut chunks) = mpsc::channel(2);
     let writing = spawn_blocking({
         let (output, stop) = (output.clone(), stop.clone());
         move || write_chunks(&output, &stop, &mut chunks)
     });
     let fetched = tokio::select! {
-        fetched = fetch(&args, send) => fetched,
+        fetched = fetch(&args, &access, send) => fetched,
         () = stop.cancelled() => Err(Failure::Interrupted),
     };
     // The file is whole or removed when this process ends.
@@ -40,7 +41,7 @@ pub(crate) async fn run(args: ImageArgs, stop: &CancellationToken) -> Result<(),
     fetched?;
     written?;
     if !args.partial && !args.keep {
-        forget(&args).await;
+        forget(&args, &access).await;
     }
     if args.json {
         tell(true, &picture_json(args.job, output.name(), None), "")?;
@@ -49,9 +50,9 @@ pub(crate) async fn run(args: ImageArgs, stop: &CancellationToken) -> Result<(),
 }
 
 /// Has the farm forget a job whose picture is here. If it does not it will keep it for a while.
-async fn forget(args: &ImageArgs) {
+async fn forget(args: &ImageArgs, access: &Access) {
     let request = wire::CancelRequest { job: args.job, ..wire::CancelRequest::default() };
-    let cancel = async { connect(&args.coordinator).await?.cancel(request).await.map_err(refused) };
+    let cancel = async { connect(access).await?.cancel(request).await.map_err(refused) };
     let forgotten = match timeout(FORGET_DEADLINE, cancel).await {
         Ok(forgotten) => forgotten.map(drop),
         Err(elapsed) => Err(late(elapsed)),
@@ -62,8 +63,12 @@ async fn forget(args: &ImageArgs) {
 }
 
 /// Brings the picture and hands it on, piece by piece; the last one is empty.
-async fn fetch(args: &ImageArgs, send: mpsc::Sender<wire::Chunk>) -> Result<(), Failure> {
-    let mut client = connect(&args.coordinator).await?;
+async fn fetch(
+    args: &ImageArgs,
+    access: &Access,
+    send: mpsc::Sender<wire::Chunk>,
+) -> Result<(), Failure> {
+    let mut client = connect(access).await?;
     let ImageArgs { job, partial, .. } = *args;
     let image = client.image(wire::ImageRequest { job, partial, ..wire::ImageRequest::default() });
     let image = timeout(IMAGE_DEADLINE, image).await.map_err(late)?;

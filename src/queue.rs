@@ -12,13 +12,13 @@ use rtfarm_client::{FIRST_PAUSE, LONGEST_PAUSE, is_lost, plain};
 use rtfarm_core::{render::Tally, tile::Size};
 use rtfarm_job::Progress;
 use rtfarm_proto::{
-    Address,
+    Access, Reached,
     wire::{self, Standing, control_request::Change, event, jobs_client::JobsClient},
 };
 use serde_json::{Value, json};
 use tokio::time::{Instant, sleep, timeout};
 use tokio_util::sync::CancellationToken;
-use tonic::{Status, transport::Channel};
+use tonic::Status;
 
 use crate::{
     args::{FarmArgs, WatchArgs},
@@ -46,8 +46,9 @@ pub(crate) async fn run(
     wish: Wish,
     stop: &CancellationToken,
 ) -> Result<(), Failure> {
+    let access = args.coordinator.access().map_err(Failure::Input)?;
     let asked = async {
-        let client = connect(&args.coordinator).await?;
+        let client = connect(&access).await?;
         timeout(DEADLINE, ask(client, wish)).await.map_err(late)?
     };
     let answer = tokio::select! {
@@ -82,9 +83,9 @@ pub(crate) fn tell(as_json: bool, json: &Value, text: &str) -> Result<(), Failur
 }
 
 /// Reaches the coordinator.
-pub(crate) async fn connect(address: &Address) -> anyhow::Result<JobsClient<Channel>> {
-    let client = timeout(DEADLINE, reach(address)).await.map_err(late)?;
-    client.with_context(|| format!("no coordinator answers at {address}"))
+pub(crate) async fn connect(access: &Access) -> anyhow::Result<JobsClient<Reached>> {
+    let client = timeout(DEADLINE, reach(access)).await.map_err(late)?;
+    client.with_context(|| format!("no coordinator answers at {}", access.address()))
 }
 
 pub(crate) fn late(_: tokio::time::error::Elapsed) -> anyhow::Error {
@@ -96,7 +97,7 @@ pub(crate) fn refused(status: Status) -> anyhow::Error {
     anyhow!("the coordinator says: {}", plain(status.message()))
 }
 
-async fn ask(mut client: JobsClient<Channel>, wish: Wish) -> anyhow::Result<Answer> {
+async fn ask(mut client: JobsClient<Reached>, wish: Wish) -> anyhow::Result<Answer> {
     Ok(match wish {
         Wish::Jobs => {
             let list = client.list(wire::ListRequest {}).await.map_err(refused)?;
@@ -313,8 +314,9 @@ pub(crate) async fn watch(
     console: &Console,
     stop: &CancellationToken,
 ) -> Result<(), Failure> {
+    let access = args.farm.coordinator.access().map_err(Failure::Input)?;
     let last = tokio::select! {
-        last = follow(&args, console) => last?,
+        last = follow(&args, &access, console) => last?,
         () = stop.cancelled() => return Err(Failure::Interrupted),
     };
     let mut json = progress_json(&last);
@@ -338,13 +340,17 @@ pub(crate) async fn watch(
 
 /// Follows a job to its end. A coordinator that was reached once and is gone is looked for until
 /// `--patience` is over.
-async fn follow(args: &WatchArgs, console: &Console) -> anyhow::Result<wire::Event> {
+async fn follow(
+    args: &WatchArgs,
+    access: &Access,
+    console: &Console,
+) -> anyhow::Result<wire::Event> {
     let mut gone_since: Option<Instant> = None;
     let mut pause = FIRST_PAUSE;
     let mut last = None;
     loop {
         let mut seen = None;
-        let gone = match watch_once(args, console, &mut seen).await {
+        let gone = match watch_once(args, access, console, &mut seen).await {
             Ok(last) => return Ok(last),
             Err(Ended::Refused(error)) => return Err(error),
             Err(Ended::Gone(error)) => error,
@@ -373,6 +379,7 @@ enum Ended {
 /// Shows what the coordinator tells of a job, the last of which is in `seen`; answers with its end.
 async fn watch_once(
     args: &WatchArgs,
+    access: &Access,
     console: &Console,
     seen: &mut Option<wire::Event>,
 ) -> Result<wire::Event, Ended> {
@@ -383,7 +390,7 @@ async fn watch_once(
             Ended::Refused(refused(status))
         }
     };
-    let mut client = connect(&args.farm.coordinator).await.map_err(Ended::Gone)?;
+    let mut client = connect(access).await.map_err(Ended::Gone)?;
     let request = wire::WatchRequest { job: args.job, ..wire::WatchRequest::default() };
     let events = timeout(DEADLINE, client.watch(request)).await;
     let events = events.map_err(|elapsed| Ended::Gone(late(elapsed)))?;

@@ -10,14 +10,13 @@ use std::{
 use rtfarm_client::{Ended, Finished, JobState, Order, Outside, Trouble};
 use rtfarm_job::Progress;
 use rtfarm_proto::{
-    Address, CHUNK_BYTES, JobId, MESSAGE_BYTES, PROTOCOL,
+    Access, CHUNK_BYTES, ConnectError, JobId, MESSAGE_BYTES, PROTOCOL, Reached,
     wire::{self, jobs_client::JobsClient, submit_request::Part},
 };
 use serde_json::json;
 use tokio::{sync::mpsc, task::spawn_blocking, time::Instant};
 use tokio_stream::{Stream, wrappers::ReceiverStream};
 use tokio_util::sync::CancellationToken;
-use tonic::transport::Channel;
 
 use crate::{
     VERSION,
@@ -40,17 +39,19 @@ pub(crate) async fn run(
     let mut output = args.picture.output().map_err(Failure::Input)?;
     output.check()?;
     let text = Arc::new(SceneText::read(&args.picture.scene, stop).await?);
+    let access = args.coordinator.access().map_err(Failure::Input)?;
     let key = match &args.key {
         Some(key) => key.clone(),
         None => random_key()?,
     };
     let order = Order {
         scene: args.picture.scene.name(),
-        coordinator: args.coordinator.clone(),
+        coordinator: access.address().clone(),
         patience: args.patience,
         is_detached: args.detach,
     };
-    let mut here = Here { args: &args, output: &output, console, stop, key, text, bar: None };
+    let mut here =
+        Here { args: &args, access, output: &output, console, stop, key, text, bar: None };
     let ended = rtfarm_client::run(&mut here, order, stop).await.map_err(Failure::of_client);
 
     let (job, finished) = match ended? {
@@ -99,6 +100,7 @@ fn login_name() -> String {
 /// The user, the files and the network of this machine.
 struct Here<'a> {
     args: &'a SubmitArgs,
+    access: Access,
     output: &'a Output,
     console: &'a Console,
     stop: &'a CancellationToken,
@@ -109,14 +111,15 @@ struct Here<'a> {
 }
 
 impl Outside for Here<'_> {
-    type Connection = Channel;
+    type Connection = Reached;
 
     fn connect(
         &self,
-    ) -> impl Future<Output = Result<JobsClient<Channel>, Trouble>> + Send + 'static {
-        let address = self.args.coordinator.clone();
+    ) -> impl Future<Output = Result<JobsClient<Reached>, Trouble>> + Send + 'static {
+        let access = self.access.clone();
         async move {
-            let reached = reach(&address).await.map_err(anyhow::Error::from);
+            let reached = reach(&access).await.map_err(anyhow::Error::from);
+            let address = access.address().clone();
             reached.map_err(|error| Trouble::Connect(address, format!("{error:#}")))
         }
     }
@@ -237,10 +240,8 @@ fn parts(
 }
 
 /// Reaches a coordinator.
-pub(crate) async fn reach(
-    address: &Address,
-) -> Result<JobsClient<Channel>, tonic::transport::Error> {
-    let client = JobsClient::new(address.connect().await?);
+pub(crate) async fn reach(access: &Access) -> Result<JobsClient<Reached>, ConnectError> {
+    let client = JobsClient::new(access.connect().await?);
     Ok(client.max_decoding_message_size(MESSAGE_BYTES).max_encoding_message_size(MESSAGE_BYTES))
 }
 

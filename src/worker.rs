@@ -24,7 +24,7 @@ pub(crate) async fn run(
         isa: args.isa.0,
         memory: args.memory(),
         patience: if is_local { LOCAL_PATIENCE } else { args.patience },
-        coordinator: args.coordinator,
+        coordinator: args.coordinator.access().map_err(Failure::Input)?,
         version: args.claim_version,
         build: BUILD.to_owned(),
         reference: (!is_local).then(|| rtfarm_worker::reference(args.isa.0)),

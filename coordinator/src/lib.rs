@@ -9,12 +9,13 @@
 //! ```text
 //! identity, tiles, pace <- lease, members, waiting, audit <- farm, store, record <- state <- job
 //! job <- shell <- service <- run
-//! accept <- run
+//! security, accept <- guard <- service; accept <- run
 //! ```
 
 mod accept;
 mod audit;
 mod farm;
+mod guard;
 mod identity;
 mod job;
 mod lease;
@@ -26,6 +27,7 @@ mod record;
 #[cfg(test)]
 mod restart;
 mod run;
+mod security;
 mod service;
 mod shell;
 #[cfg(test)]
@@ -39,9 +41,10 @@ mod waiting;
 #[cfg(test)]
 mod whole_farm;
 
-pub use accept::listen;
+pub use accept::{Limits, listen};
 pub use farm::Keeping;
 pub use job::Job;
-pub use run::{Coordinator, Listener};
+pub use run::{Coordinator, Listener, ServeError};
+pub use security::{Role, Security, SecurityError, renew_token, revoke_token};
 pub use shell::{Config, SubmitError};
 pub use state::{Durability, StateError, StateFolder};

@@ -13,18 +13,19 @@ use rtfarm_picture::{Canvas, TileRecord};
 use rtfarm_proto::JobId;
 use tokio::{
     io::{AsyncRead, AsyncWrite},
-    net::{TcpListener, UnixListener},
-    sync::mpsc,
+    net::{TcpListener, TcpStream, UnixListener},
+    sync::{Semaphore, mpsc},
 };
 use tokio_stream::wrappers::ReceiverStream;
 use tokio_util::sync::CancellationToken;
-use tonic::transport::server::{Connected, Router};
+use tonic::transport::server::Router;
 
 use crate::{
-    accept::{WAITING, accept_all},
+    accept::{Door, Limits, WAITING, accept_all},
     identity::Identity,
     job::Job,
     record::Ticket,
+    security::Security,
     service,
     shell::{Config, Shell, SubmitError},
     state::StateFolder,
@@ -41,8 +42,10 @@ pub struct Coordinator {
 pub enum Listener {
     /// A socket on this machine.
     Unix(UnixListener),
-    /// TCP.
+    /// TCP, where nothing is encrypted and nobody is asked for a token.
     Tcp(TcpListener),
+    /// TLS over TCP, for those who have a token.
+    Tls(TcpListener, Security, Limits),
 }
 
 /// How long connections may take to close when the coordinator stops.
@@ -116,8 +119,8 @@ impl Coordinator {
         &self,
         listener: Listener,
         shutdown: impl Future<Output = ()>,
-    ) -> Result<(), tonic::transport::Error> {
-        let serve = serve(service::router(&self.shell), listener, self.shell.stop.clone());
+    ) -> Result<(), ServeError> {
+        let serve = serve(&self.shell, listener, self.shell.stop.clone());
         let close = async {
             shutdown.await;
             self.shell.shut_down();
@@ -136,43 +139,68 @@ impl Coordinator {
     }
 }
 
+/// Why nobody is served.
+#[derive(Debug, thiserror::Error)]
+pub enum ServeError {
+    /// Connections cannot be served.
+    #[error(transparent)]
+    Transport(#[from] tonic::transport::Error),
+    /// The certificate cannot be read.
+    #[error("cannot read the certificate: {0}")]
+    Certificate(#[from] io::Error),
+}
+
 async fn serve(
-    router: Router,
+    shell: &Arc<Shell>,
     listener: Listener,
     stop: CancellationToken,
-) -> Result<(), tonic::transport::Error> {
+) -> Result<(), ServeError> {
+    let door = |is_local| Door { is_local, limits: Limits::default(), places: None };
     match listener {
         Listener::Unix(listener) => {
             let accept = |context: &mut Context<'_>| {
                 listener.poll_accept(context).map_ok(|(stream, _)| stream)
             };
-            serve_accepted(router, accept, stop).await
+            let router = service::router(shell, None, None)?;
+            Ok(serve_accepted(router, accept, door(true), stop).await?)
         }
         Listener::Tcp(listener) => {
-            let accept = |context: &mut Context<'_>| {
-                let accepted = ready!(listener.poll_accept(context));
-                // Messages are written whole: none gains by waiting for the next.
-                Poll::Ready(
-                    accepted.and_then(|(stream, _)| stream.set_nodelay(true).map(|()| stream)),
-                )
-            };
-            serve_accepted(router, accept, stop).await
+            let router = service::router(shell, None, None)?;
+            Ok(serve_accepted(router, accept_tcp(&listener), door(false), stop).await?)
         }
+        Listener::Tls(listener, security, limits) => {
+            let tls = security.tls(limits.handshake)?;
+            let router = service::router(shell, Some(Arc::new(security)), Some(tls))?;
+            let places = Some(Arc::new(Semaphore::new(limits.strangers)));
+            let door = Door { is_local: false, limits, places };
+            Ok(serve_accepted(router, accept_tcp(&listener), door, stop).await?)
+        }
+    }
+}
+
+fn accept_tcp(
+    listener: &TcpListener,
+) -> impl FnMut(&mut Context<'_>) -> Poll<io::Result<TcpStream>> {
+    |context| {
+        let accepted = ready!(listener.poll_accept(context));
+        // Messages are written whole: none gains by waiting for the next.
+        Poll::Ready(accepted.and_then(|(stream, _)| stream.set_nodelay(true).map(|()| stream)))
     }
 }
 
 async fn serve_accepted<S>(
     router: Router,
     accept: impl FnMut(&mut Context<'_>) -> Poll<io::Result<S>>,
+    door: Door,
     stop: CancellationToken,
 ) -> Result<(), tonic::transport::Error>
 where
-    S: AsyncRead + AsyncWrite + Connected + Unpin + Send + 'static,
+    S: AsyncRead + AsyncWrite + Unpin + Send + 'static,
 {
     let (send, connections) = mpsc::channel(WAITING);
     let connections = ReceiverStream::new(connections);
     let serve = router.serve_with_incoming_shutdown(connections, stop.cancelled_owned());
     // Accepting ends when nobody takes connections any more.
-    let (served, ()) = tokio::join!(serve, accept_all(accept, send));
+    let (served, ()) = tokio::join!(serve, accept_all(accept, door, send));
     served
 }

@@ -29,19 +29,19 @@ use tokio_stream::{Stream, wrappers::ReceiverStream};
 use tokio_util::sync::CancellationToken;
 use tonic::{
     Request, Response, Status, Streaming,
-    transport::{
-        Server,
-        server::{Router, UdsConnectInfo},
-    },
+    transport::{Server, ServerTlsConfig, server::Router},
 };
 
 use crate::{
+    accept::Peer,
     farm::{Change, Delivery, JobEntry, JobPhase, Next, Refused, Verdict},
+    guard::Guarded,
     identity::Stranger,
     job::Job,
     lease::Run,
     members::{MemberEntry, NoMember, Process, Standing},
     record::{Ticket, to_event, to_standing},
+    security::Security,
     shell::{ChangeError, Config, Shell},
     tiles::PixelHash,
 };
@@ -55,20 +55,28 @@ const WATCH_PERIOD: Duration = Duration::from_millis(50);
 type Chunks = Pin<Box<dyn Stream<Item = Result<wire::Chunk, Status>> + Send>>;
 type Events = Pin<Box<dyn Stream<Item = Result<wire::Event, Status>> + Send>>;
 
-/// Both services over one coordinator.
-pub(crate) fn router(shell: &Arc<Shell>) -> Router {
+/// Both services over one coordinator, for those who have a token if there is `security`.
+pub(crate) fn router(
+    shell: &Arc<Shell>,
+    security: Option<Arc<Security>>,
+    tls: Option<ServerTlsConfig>,
+) -> Result<Router, tonic::transport::Error> {
     const WINDOW_BYTES: u32 = 1 << 22;
     // A frame of a delivery; each costs both sides a call of the system.
     const FRAME_BYTES: u32 = 1 << 17;
     let (farm, jobs) = services(shell);
-    Server::builder()
+    let server = match tls {
+        Some(tls) => Server::builder().tls_config(tls)?,
+        None => Server::builder(),
+    };
+    Ok(server
         .initial_stream_window_size(WINDOW_BYTES)
         .initial_connection_window_size(WINDOW_BYTES)
         .max_frame_size(FRAME_BYTES)
         .http2_keepalive_interval(Some(Duration::from_secs(10)))
         .http2_keepalive_timeout(Some(Duration::from_secs(20)))
-        .add_service(farm)
-        .add_service(jobs)
+        .add_service(Guarded::new(farm, security.clone()))
+        .add_service(Guarded::new(jobs, security)))
 }
 
 /// What workers call, and what clients call.
@@ -115,7 +123,7 @@ impl farm_server::Farm for FarmService {
         &self,
         request: Request<wire::LeaseRequest>,
     ) -> Result<Response<wire::LeaseResponse>, Status> {
-        let is_local = request.extensions().get::<UdsConnectInfo>().is_some();
+        let is_local = request.extensions().get::<Peer>().is_some_and(|peer| peer.is_local);
         let wire::LeaseRequest { worker, max_tiles, wait_ms, incarnation, kept } =
             request.into_inner();
         self.shell.admit(incarnation).map_err(stranger)?;

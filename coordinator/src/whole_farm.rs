@@ -26,7 +26,7 @@ use rtfarm_core::{
 use rtfarm_job::{Order, RenderRequest};
 use rtfarm_picture::{Cache, Disk, Picture, PictureFormat};
 use rtfarm_proto::{
-    Address, Bytes, JobId, PROTOCOL,
+    Access, Address, Bytes, JobId, PROTOCOL,
     wire::{self, Verdict, jobs_client::JobsClient, lease_response, submit_request::Part},
 };
 use rtfarm_worker::{
@@ -666,7 +666,7 @@ struct Surroundings {
 impl Outside for Surroundings {
     type Connection = Net;
 
-    async fn connect(&self, _: &Address) -> Result<Net, String> {
+    async fn connect(&self, _: &Access) -> Result<Net, String> {
         self.net.hop().await.map_err(|error| error.to_string())?;
         self.net.world.current().map(|_| self.net.clone()).ok_or_else(|| "refused".to_owned())
     }
@@ -730,7 +730,7 @@ impl World {
         loop {
             let Host { threads, is_liar, .. } = self.hosts[host];
             let config = rtfarm_worker::Config {
-                coordinator: coordinator(),
+                coordinator: coordinator().into(),
                 threads,
                 isa: Isa::Scalar,
                 version: "1".to_owned(),

@@ -13,7 +13,7 @@ use rtfarm_core::{
     tile::{Size, TileGrid},
 };
 use rtfarm_proto::{
-    Address, Bytes, JobId, LeaseName, PROTOCOL, TileHasher, pixels_to_bytes, scene_hash,
+    Access, Address, Bytes, JobId, LeaseName, PROTOCOL, TileHasher, pixels_to_bytes, scene_hash,
     wire::{
         self, event::End, farm_client::FarmClient, jobs_client::JobsClient, lease_response::Next,
         submit_request::Part, submit_response::Outcome,
@@ -518,8 +518,8 @@ struct Surroundings {
 impl Outside for Surroundings {
     type Connection = Noted;
 
-    async fn connect(&self, address: &Address) -> Result<Noted, String> {
-        let channel = address.connect().await.map_err(|error| error.to_string())?;
+    async fn connect(&self, access: &Access) -> Result<Noted, String> {
+        let channel = access.address().connect().await.map_err(|error| error.to_string())?;
         let mut number = self.connection_count.lock().unwrap();
         *number += 1;
         Ok(Noted { channel, number: *number, calls: Arc::clone(&self.calls) })
@@ -541,7 +541,7 @@ async fn a_scene_comes_over_a_connection_of_its_own() {
     let surroundings =
         Surroundings { connection_count: Mutex::default(), calls: Arc::clone(&calls) };
     let config = rtfarm_worker::Config {
-        coordinator: farm.address.clone(),
+        coordinator: farm.address.clone().into(),
         threads: 1,
         isa: rtfarm_core::isa::Isa::Scalar,
         version: VERSION.to_owned(),

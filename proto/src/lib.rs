@@ -2,11 +2,13 @@
 //! `farm.proto`, names for what they number, their conversions to and from the core's types, and
 //! where a coordinator is found. Nothing is decided here.
 
+mod access;
 mod address;
 mod convert;
 mod name;
 mod tile_hash;
 
+pub use access::{Access, AccessError, CERTIFIED_NAME, ConnectError, Reached};
 pub use address::{Address, AddressError, Connection};
 pub use convert::{WireError, pixels_to_bytes, scene_hash, transfer};
 pub use name::{FarmId, Incarnation, JobId, LeaseId, LeaseName, Renewal, WorkerId};

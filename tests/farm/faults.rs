@@ -228,7 +228,7 @@ impl Farm<'_> {
     }
 
     fn start_coordinator(&mut self) {
-        let args = ["coordinator", "--listen", ADDRESS, "--insecure", "--state", "disk"];
+        let args = ["coordinator", "--insecure", "--listen", ADDRESS, "--state", "disk"];
         let mut coordinator = self.start(0, "coordinator", &args);
         let line = coordinator.read_line();
         assert!(line.starts_with("listening on"), "{line}{}", coordinator.log());

@@ -5,6 +5,7 @@ mod faults;
 mod frames;
 mod liar;
 mod queue;
+mod security;
 
 use std::{
     collections::BTreeSet,
@@ -370,7 +371,7 @@ fn logs_count_every_tile_as_text_and_as_json() {
 fn a_farm_over_tcp_gives_the_same_bytes() {
     let place = Place::new();
     let mut coordinator =
-        place.start("coordinator.log", &["coordinator", "--listen", "127.0.0.1:0"]);
+        place.start("coordinator.log", &["coordinator", "--insecure", "--listen", "127.0.0.1:0"]);
     let line = coordinator.read_line();
     let url = line.trim().strip_prefix("listening on ").expect(&line);
     let worker = ["worker", "--threads", "1", "--coordinator", url];
@@ -421,7 +422,7 @@ fn a_coordinator_killed_and_started_again_gives_the_next_picture_no_pixel_of_the
     let render = [&["render", "other.rt", "-o", "here.png", "--workers", "0"], &quick[..]].concat();
     let mut here = place.start("here.log", &render);
     assert!(here.wait().success(), "{}", here.log());
-    let listen = ["coordinator", "--listen"];
+    let listen = ["coordinator", "--insecure", "--listen"];
     let mut first = place.start("first.log", &[&listen[..], &["127.0.0.1:0"]].concat());
     let line = first.read_line();
     let url = line.trim().strip_prefix("listening on ").expect(&line);
@@ -460,7 +461,7 @@ fn a_coordinator_killed_and_started_again_gives_the_next_picture_no_pixel_of_the
 fn a_killed_coordinator_with_a_state_goes_on_and_loses_no_finished_tile() {
     let place = Place::new();
     let here = place.render("here.png", &[&SLOW[..], &["--workers", "0"]].concat());
-    let coordinator = ["coordinator", "--state", "state", "--listen"];
+    let coordinator = ["coordinator", "--insecure", "--state", "state", "--listen"];
     let mut first = place.start("first.log", &[&coordinator[..], &["127.0.0.1:0"]].concat());
     let line = first.read_line();
     let url = line.trim().strip_prefix("listening on ").expect(&line).to_owned();
@@ -500,7 +501,7 @@ fn a_killed_coordinator_with_a_state_goes_on_and_loses_no_finished_tile() {
     }
     fs::write(place.path("state/farm"), "another thing").unwrap();
     check_refused(&place, &[&coordinator[..], &[address]].concat(), 1, "it is no record of a farm");
-    let foreign = ["coordinator", "--listen", address, "--state", "."];
+    let foreign = ["coordinator", "--insecure", "--listen", address, "--state", "."];
     check_refused(&place, &foreign, 2, ". is not empty and holds no state of a farm");
     place.check_nothing_is_left();
 }
@@ -509,7 +510,8 @@ fn a_killed_coordinator_with_a_state_goes_on_and_loses_no_finished_tile() {
 fn a_state_on_a_full_disk_refuses_a_job_and_goes_on() {
     let place = Place::new();
     with_small_disk(&place, "64k", || {
-        let coordinator = ["coordinator", "--listen", "127.0.0.1:0", "--state", "disk/state"];
+        let coordinator =
+            ["coordinator", "--insecure", "--listen", "127.0.0.1:0", "--state", "disk/state"];
         let mut coordinator = place.start("coordinator.log", &coordinator);
         let line = coordinator.read_line();
         let url = line.trim().strip_prefix("listening on ").expect(&line).to_owned();
@@ -572,7 +574,7 @@ fn an_interrupted_render_goes_on_where_it_was() {
 fn an_interrupted_submit_ends_its_job() {
     let place = Place::new();
     let mut coordinator =
-        place.start("coordinator.log", &["coordinator", "--listen", "127.0.0.1:0"]);
+        place.start("coordinator.log", &["coordinator", "--insecure", "--listen", "127.0.0.1:0"]);
     let line = coordinator.read_line();
     let url = line.trim().strip_prefix("listening on ").expect(&line);
     let _worker = place.start("worker.log", &["worker", "--threads", "1", "--coordinator", url]);
@@ -706,7 +708,7 @@ fn a_port_in_use_and_a_missing_coordinator_are_told() {
     let taken = TcpListener::bind("127.0.0.1:0").unwrap();
     let address = taken.local_addr().unwrap().to_string();
     let reason = format!("cannot listen on {address}: Address already in use");
-    check_refused(&place, &["coordinator", "--listen", &address], 1, &reason);
+    check_refused(&place, &["coordinator", "--insecure", "--listen", &address], 1, &reason);
 
     drop(taken);
     let url = format!("http://{address}");
@@ -721,7 +723,7 @@ fn a_port_in_use_and_a_missing_coordinator_are_told() {
 /// A farm's coordinator, started, and its address.
 fn start_coordinator(place: &Place) -> (Process, String) {
     let mut coordinator =
-        place.start("coordinator.log", &["coordinator", "--listen", "127.0.0.1:0"]);
+        place.start("coordinator.log", &["coordinator", "--insecure", "--listen", "127.0.0.1:0"]);
     let line = coordinator.read_line();
     let url = line.trim().strip_prefix("listening on ").expect(&line).to_owned();
     (coordinator, url)
@@ -819,7 +821,7 @@ fn a_file_outside_of_the_scenes_folder_is_sent_only_if_it_is_allowed() {
 fn a_reader_of_the_log_that_stands_still_stops_nothing() {
     let place = Place::new();
     let mut coordinator = Command::new(env!("CARGO_BIN_EXE_rtfarm"))
-        .args(["coordinator", "--listen", "127.0.0.1:0"])
+        .args(["coordinator", "--insecure", "--listen", "127.0.0.1:0"])
         .env("TMPDIR", place.path("tmp"))
         // Every request is told, more than a pipe holds.
         .env("RUST_LOG", "debug")

@@ -10,7 +10,16 @@ fn start_farm(place: &Place, listen: &str) -> (Process, String) {
 }
 
 fn start_farm_with(place: &Place, listen: &str, more: &[&str]) -> (Process, String) {
-    let args = ["coordinator", "--listen", listen, "--state", "state", "--lease-seconds", "0.5"];
+    let args = [
+        "coordinator",
+        "--insecure",
+        "--listen",
+        listen,
+        "--state",
+        "state",
+        "--lease-seconds",
+        "0.5",
+    ];
     let mut coordinator = place.start("coordinator.log", &[&args[..], more].concat());
     let line = coordinator.read_line();
     let url = line.trim().strip_prefix("listening on ").expect(&line).to_owned();

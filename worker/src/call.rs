@@ -101,6 +101,8 @@ pub(crate) enum CallErrorKind {
     NotMember,
     /// It does not want this worker.
     Refused,
+    /// This worker's token does not allow it.
+    Forbidden,
     /// Its answer cannot be understood.
     Nonsense,
     /// It has another reason.

@@ -143,6 +143,7 @@ impl From<Status> for CallError {
             | Code::Cancelled
             | Code::DataLoss => CallErrorKind::NoAnswer,
             Code::NotFound => CallErrorKind::NotMember,
+            Code::Unauthenticated | Code::PermissionDenied => CallErrorKind::Forbidden,
             Code::FailedPrecondition | Code::InvalidArgument => CallErrorKind::Refused,
             _ => CallErrorKind::Other,
         };

@@ -3,13 +3,13 @@
 use std::time::Duration;
 
 use rtfarm_core::isa::Isa;
-use rtfarm_proto::Address;
+use rtfarm_proto::Access;
 
 /// How a worker works.
 #[derive(Debug, Clone)]
 pub struct Config {
-    /// Where its coordinator is.
-    pub coordinator: Address,
+    /// How its coordinator is reached.
+    pub coordinator: Access,
     /// Threads that render, at least 1.
     pub threads: usize,
     /// The instruction set that they render with.

@@ -3,19 +3,18 @@
 use std::{error::Error, panic::resume_unwind};
 
 use rayon::{ThreadPool, ThreadPoolBuildError, ThreadPoolBuilder};
-use rtfarm_proto::{Address, Connection};
+use rtfarm_proto::{Access, Connection, Reached};
 use tokio::time::Instant;
-use tonic::transport::Channel;
 
 /// What a worker reaches the world by.
 pub trait Outside: Send + Sync + 'static {
     /// Reaches a coordinator.
     type Connection: Connection;
 
-    /// Reaches the coordinator at an address, or says why it cannot.
+    /// Reaches a coordinator, or says why it cannot.
     fn connect(
         &self,
-        address: &Address,
+        access: &Access,
     ) -> impl Future<Output = Result<Self::Connection, String>> + Send;
 
     /// Hands work to the threads, which begin what came earlier first, and tell it when it begins.
@@ -44,10 +43,10 @@ impl Machine {
 }
 
 impl Outside for Machine {
-    type Connection = Channel;
+    type Connection = Reached;
 
-    async fn connect(&self, address: &Address) -> Result<Channel, String> {
-        address.connect().await.map_err(|error| {
+    async fn connect(&self, access: &Access) -> Result<Reached, String> {
+        access.connect().await.map_err(|error| {
             let mut reason: &dyn Error = &error;
             while let Some(source) = reason.source() {
                 reason = source;

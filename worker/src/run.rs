@@ -189,9 +189,9 @@ impl<O: Outside> Shell<O> {
 
     fn call(&mut self, task: TaskId, call: Call) {
         let Some(client) = self.client.clone() else {
-            let (outside, address) = (Arc::clone(&self.outside), self.config.coordinator.clone());
+            let (outside, access) = (Arc::clone(&self.outside), self.config.coordinator.clone());
             return self.start(task, async move {
-                let connected = outside.connect(&address).await.map(client::over);
+                let connected = outside.connect(&access).await.map(client::over);
                 connected.map_or_else(Report::unreached, Report::Connected)
             });
         };
@@ -204,13 +204,13 @@ impl<O: Outside> Shell<O> {
 
     fn fetch(&mut self, task: TaskId, job: Arc<Job>, lease: LeaseName, silence: Duration) {
         let (outside, pulse) = (Arc::clone(&self.outside), Arc::clone(&self.pulse));
-        let address = self.config.coordinator.clone();
+        let access = self.config.coordinator.clone();
         self.start(task, async move {
             let hash = job.scene;
             let beat = move || pulse.beat((lease, None));
             // A connection of its own: what comes over it takes no share from calls.
-            let connect = async || outside.connect(&address).await.map(client::over);
-            let is_local = matches!(address, Address::Unix(_));
+            let connect = async || outside.connect(&access).await.map(client::over);
+            let is_local = matches!(access.address(), Address::Unix(_));
             let loaded = match scene::bring(&job, is_local, silence, connect, &beat).await {
                 Ok(file) => outside.block(move || scene::open(&file, &job, &beat)).await,
                 Err(error) => Err(error),

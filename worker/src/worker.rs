@@ -132,7 +132,7 @@ impl Worker {
         let mut tasks = Tasks::new(config.patience, seed);
         tasks.call(Call::Connect, now);
         Self {
-            coordinator: config.coordinator.clone(),
+            coordinator: config.coordinator.address().clone(),
             threads: config.threads,
             memory: config.memory,
             tasks,
@@ -292,6 +292,7 @@ impl Worker {
             (Call::Join, CallErrorKind::Refused) => WorkerError::Refused(message),
             (Call::Join, _) => WorkerError::Gone(message),
             (_, CallErrorKind::NotMember) => return self.join_again(call, &message, now),
+            (_, CallErrorKind::Forbidden) => WorkerError::Refused(message),
             (_, CallErrorKind::Nonsense) => WorkerError::Nonsense(message),
             _ => WorkerError::Gone(message),
         };

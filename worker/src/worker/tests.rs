@@ -107,7 +107,7 @@ impl Bench {
 
     fn with(threads: usize, patience: Duration, memory: Option<u64>) -> Self {
         let config = Config {
-            coordinator: Address::Tcp("host:1".to_owned()),
+            coordinator: Address::Tcp("host:1".to_owned()).into(),
             threads,
             isa: rtfarm_core::isa::Isa::fastest(),
             version: "1".to_owned(),
@@ -720,7 +720,7 @@ fn a_silent_coordinator_is_given_up_within_patience_though_an_answer_might_take_
 #[test]
 fn workers_do_not_all_ask_again_at_once() {
     let config = Config {
-        coordinator: Address::Tcp("host:1".to_owned()),
+        coordinator: Address::Tcp("host:1".to_owned()).into(),
         threads: 1,
         isa: rtfarm_core::isa::Isa::fastest(),
         version: "1".to_owned(),

@@ -1,0 +1,67 @@
+//! Lets only those in who may come: each call is looked at before its body is read.
+
+use std::{
+    convert::Infallible,
+    future::ready,
+    pin::Pin,
+    sync::Arc,
+    task::{Context, Poll},
+};
+
+use tonic::{
+    body::Body,
+    codegen::{
+        Service,
+        http::{HeaderValue, Request, Response, header::AUTHORIZATION},
+    },
+    server::NamedService,
+};
+
+use crate::{accept::Peer, security::Security};
+
+/// A service whose callers must show a token, unless there is nobody to ask for one.
+#[derive(Clone)]
+pub(crate) struct Guarded<S> {
+    service: S,
+    security: Option<Arc<Security>>,
+}
+
+impl<S> Guarded<S> {
+    pub(crate) fn new(service: S, security: Option<Arc<Security>>) -> Self {
+        Self { service, security }
+    }
+}
+
+impl<S: NamedService> NamedService for Guarded<S> {
+    const NAME: &'static str = S::NAME;
+}
+
+type Answering = Pin<Box<dyn Future<Output = Result<Response<Body>, Infallible>> + Send>>;
+
+impl<S> Service<Request<Body>> for Guarded<S>
+where
+    S: Service<Request<Body>, Response = Response<Body>, Error = Infallible, Future = Answering>,
+{
+    type Response = Response<Body>;
+    type Error = Infallible;
+    type Future = Answering;
+
+    fn poll_ready(&mut self, context: &mut Context<'_>) -> Poll<Result<(), Infallible>> {
+        self.service.poll_ready(context)
+    }
+
+    fn call(&mut self, request: Request<Body>) -> Answering {
+        if let Some(security) = &self.security {
+            let path = request.uri().path();
+            let shown = request.headers().get(AUTHORIZATION).map(HeaderValue::as_bytes);
+            if let Err(status) = security.check(path, shown) {
+                tracing::warn!(path, reason = status.message(), "refused a call");
+                return Box::pin(ready(Ok(status.into_http())));
+            }
+            if let Some(peer) = request.extensions().get::<Peer>() {
+                peer.admit();
+            }
+        }
+        self.service.call(request)
+    }
+}

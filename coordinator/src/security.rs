@@ -1,0 +1,418 @@
+//! Who may do what on a farm that others can reach: its certificate, and tokens, which are kept as
+//! hashes. In a farm's state there is a folder for both:
+//!
+//! ```text
+//! access/authority      the farm's own authority: its certificate and key, as PEM
+//! access/certificate    what the coordinator shows: likewise, vouched for by the authority
+//! access/tokens         the address, then a line a role: its name and its token's BLAKE3 hash
+//! access/submit, work, read, admin     access files, to be handed to those who need them
+//! ```
+//!
+//! Tokens are 32 random bytes: a plain hash of one tells nothing.
+
+use std::{
+    fmt,
+    fs::{self, DirBuilder, Metadata},
+    io::{self, Write},
+    os::unix::fs::{DirBuilderExt, MetadataExt},
+    path::{Path, PathBuf},
+    str::FromStr,
+    sync::Mutex,
+    time::Duration,
+};
+
+use blake3::Hash;
+use rcgen::{BasicConstraints, CertificateParams, DnType, IsCa, Issuer, KeyPair, KeyUsagePurpose};
+use rtfarm_proto::{Access, Address, CERTIFIED_NAME};
+use tempfile::NamedTempFile;
+use tokio::time::Instant;
+use tonic::{
+    Code, Status,
+    transport::{Identity, ServerTlsConfig},
+};
+
+const FOLDER: &str = "access";
+const AUTHORITY: &str = "authority";
+const CERTIFICATE: &str = "certificate";
+const TOKENS: &str = "tokens";
+
+/// A token that is revoked is not taken this long afterwards, at the latest.
+const REREAD: Duration = Duration::from_secs(1);
+
+/// The end of a certificate as PEM.
+const END: &str = "-----END CERTIFICATE-----\n";
+
+/// What somebody may do.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Role {
+    /// Order pictures and look after the jobs.
+    Submit,
+    /// Render.
+    Work,
+    /// Look.
+    Read,
+    /// Everything.
+    Admin,
+}
+
+impl Role {
+    const ALL: [Self; 4] = [Self::Submit, Self::Work, Self::Read, Self::Admin];
+
+    fn name(self) -> &'static str {
+        match self {
+            Self::Submit => "submit",
+            Self::Work => "work",
+            Self::Read => "read",
+            Self::Admin => "admin",
+        }
+    }
+
+    /// Says whether who has this role may call that method, by its path.
+    fn may(self, path: &str) -> bool {
+        let Some((service, method)) = path.trim_start_matches('/').split_once('/') else {
+            return false;
+        };
+        let reads = matches!(method, "List" | "Workers" | "Watch" | "Image");
+        match (self, service) {
+            (Self::Admin, _) | (Self::Work, "rtfarm.v1.Farm") => true,
+            (Self::Read, "rtfarm.v1.Jobs") => reads,
+            (Self::Submit, "rtfarm.v1.Jobs") => {
+                reads || matches!(method, "Submit" | "Cancel" | "Control")
+            }
+            _ => false,
+        }
+    }
+}
+
+impl fmt::Display for Role {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.name())
+    }
+}
+
+impl FromStr for Role {
+    type Err = String;
+
+    fn from_str(name: &str) -> Result<Self, String> {
+        let role = Self::ALL.into_iter().find(|role| role.name() == name);
+        role.ok_or_else(|| format!("`{name}` is no role; there are submit, work, read and admin"))
+    }
+}
+
+/// Why a farm's certificate or tokens cannot be used.
+#[derive(Debug, thiserror::Error)]
+pub enum SecurityError {
+    /// A file cannot be read or written.
+    #[error("{path}: {error}", path = .0.display(), error = .1)]
+    Io(PathBuf, io::Error),
+    /// A file does not hold what it should.
+    #[error("{path} is damaged; remove the folder to have new certificates and tokens", path = .0.display())]
+    Damaged(PathBuf),
+    /// No certificate can be made.
+    #[error("cannot make a certificate: {0}")]
+    Certificate(#[from] rcgen::Error),
+    /// There is nothing to change.
+    #[error("there are no tokens in {}: a coordinator makes them when it starts there", .0.display())]
+    None(PathBuf),
+}
+
+/// The certificate and the tokens of a farm, in a folder.
+#[derive(Debug)]
+pub struct Security {
+    folder: PathBuf,
+    /// What the folder said when it was read.
+    known: Mutex<Known>,
+}
+
+#[derive(Debug)]
+struct Known {
+    tokens: Tokens,
+    /// By which the file is known that was read.
+    stamp: Option<(u64, i64, i64)>,
+    read_at: Instant,
+}
+
+/// The address in the access files, and a token's hash for each role that has one.
+#[derive(Debug, Clone, Default, PartialEq)]
+struct Tokens {
+    address: String,
+    hashes: Vec<(Role, Hash)>,
+}
+
+impl Security {
+    /// Opens what a farm's state has, and makes what it lacks: an authority, a certificate, a token and
+    /// an access file for each role. `address` is where others find the coordinator.
+    pub fn open(state: &Path, address: &Address) -> Result<Self, SecurityError> {
+        let folder = state.join(FOLDER);
+        if !folder.exists() {
+            DirBuilder::new()
+                .mode(0o700)
+                .create(&folder)
+                .map_err(|error| SecurityError::Io(folder.clone(), error))?;
+        }
+        if !folder.join(CERTIFICATE).exists() {
+            make_certificates(&folder)?;
+        }
+        let is_new = !folder.join(TOKENS).exists();
+        let mut tokens = if is_new { Tokens::default() } else { Tokens::read(&folder)? };
+        tokens.address = address.to_string();
+        tokens.write(&folder)?;
+        for role in Role::ALL {
+            if is_new {
+                renew_in(&folder, role)?;
+            } else if let Ok(text) = fs::read_to_string(folder.join(role.name()))
+                && let Ok(access) = Access::read(&text)
+                && access.address() != address
+                && let Some(moved) = access.at(address.clone()).text()
+            {
+                write(&folder.join(role.name()), &moved)?;
+            }
+        }
+        let known = Known { tokens: Tokens::read(&folder)?, stamp: None, read_at: Instant::now() };
+        Ok(Self { folder, known: Mutex::new(known) })
+    }
+
+    /// What the coordinator shows to those who connect; they have so long to shake hands.
+    pub(crate) fn tls(&self, handshake: Duration) -> Result<ServerTlsConfig, io::Error> {
+        let pem = fs::read_to_string(self.folder.join(CERTIFICATE))?;
+        Ok(ServerTlsConfig::new().identity(Identity::from_pem(&pem, &pem)).timeout(handshake))
+    }
+
+    /// Says whether who shows this `Authorization` may call that method. A file of tokens that was
+    /// written to is read anew.
+    pub(crate) fn check(&self, path: &str, authorization: Option<&[u8]>) -> Result<(), Status> {
+        let token = authorization.and_then(|value| value.strip_prefix(b"Bearer "));
+        let Some(token) = token else {
+            return Err(Status::unauthenticated(
+                "a token is asked for; --access FILE names the access file that has it",
+            ));
+        };
+        // Hashes of this kind are compared in constant time.
+        let hash = blake3::hash(token);
+        let known = self.known();
+        let roles = known.hashes.iter().filter(|(_, known)| *known == hash).map(|&(role, _)| role);
+        let roles: Vec<Role> = roles.collect();
+        match roles.first() {
+            None => Err(Status::unauthenticated("the token is not known, or not any more")),
+            Some(_) if roles.iter().any(|role| role.may(path)) => Ok(()),
+            Some(role) => Err(Status::new(
+                Code::PermissionDenied,
+                format!("the token is one to {role}, which does not allow this"),
+            )),
+        }
+    }
+
+    fn known(&self) -> Tokens {
+        let mut known = self.known.lock().expect("nothing here panics");
+        if known.stamp.is_none() || known.read_at.elapsed() >= REREAD {
+            known.read_at = Instant::now();
+            let of = |metadata: Metadata| (metadata.ino(), metadata.mtime(), metadata.mtime_nsec());
+            let stamp = fs::metadata(self.folder.join(TOKENS)).map(of);
+            match stamp {
+                Ok(stamp) if known.stamp == Some(stamp) => {}
+                Ok(stamp) => match Tokens::read(&self.folder) {
+                    Ok(tokens) => (known.tokens, known.stamp) = (tokens, Some(stamp)),
+                    Err(error) => tracing::error!(reason = %error, "cannot read the tokens"),
+                },
+                // Who removes the file revokes all.
+                Err(_) => (known.tokens, known.stamp) = (Tokens::default(), None),
+            }
+        }
+        known.tokens.clone()
+    }
+}
+
+/// Makes a new token and access file for a role; the old one is not taken any more. Answers with the
+/// file.
+pub fn renew_token(state: &Path, role: Role) -> Result<PathBuf, SecurityError> {
+    renew_in(&of_state(state)?, role)
+}
+
+/// Has a role's token not taken any more, and removes its access file.
+pub fn revoke_token(state: &Path, role: Role) -> Result<(), SecurityError> {
+    let folder = of_state(state)?;
+    let mut tokens = Tokens::read(&folder)?;
+    tokens.hashes.retain(|&(of, _)| of != role);
+    tokens.write(&folder)?;
+    let path = folder.join(role.name());
+    match fs::remove_file(&path) {
+        Err(error) if error.kind() != io::ErrorKind::NotFound => {
+            Err(SecurityError::Io(path, error))
+        }
+        _ => Ok(()),
+    }
+}
+
+fn of_state(state: &Path) -> Result<PathBuf, SecurityError> {
+    let folder = state.join(FOLDER);
+    if folder.join(TOKENS).exists() { Ok(folder) } else { Err(SecurityError::None(folder)) }
+}
+
+fn renew_in(folder: &Path, role: Role) -> Result<PathBuf, SecurityError> {
+    let (path, authority) = (folder.join(role.name()), folder.join(AUTHORITY));
+    let io = |error| SecurityError::Io(path.clone(), error);
+    let mut tokens = Tokens::read(folder)?;
+    let mut random = [0; 32];
+    rustix::rand::getrandom(&mut random, rustix::rand::GetRandomFlags::empty())
+        .map_err(|error| io(error.into()))?;
+    let token = Hash::from_bytes(random).to_hex().to_string();
+    let pem = fs::read_to_string(&authority)
+        .map_err(|error| SecurityError::Io(authority.clone(), error))?;
+    // The key after it is nobody else's business.
+    let certificate = pem.split_inclusive(END).next().filter(|pem| pem.ends_with(END));
+    let certificate = certificate.ok_or(SecurityError::Damaged(authority))?;
+    let address = tokens.address.parse();
+    let address = address.map_err(|_| SecurityError::Damaged(folder.join(TOKENS)))?;
+    let access = Access::new(address, certificate.to_owned(), token.clone());
+    // The file first: nobody has a token that is known and written nowhere.
+    write(&path, &access.text().expect("it has a token"))?;
+    tokens.hashes.retain(|&(of, _)| of != role);
+    tokens.hashes.push((role, blake3::hash(token.as_bytes())));
+    tokens.write(folder)?;
+    Ok(path)
+}
+
+impl Tokens {
+    fn read(folder: &Path) -> Result<Self, SecurityError> {
+        let path = folder.join(TOKENS);
+        let text = fs::read_to_string(&path);
+        let text = text.map_err(|error| SecurityError::Io(path.clone(), error))?;
+        let mut tokens = Self::default();
+        for line in text.lines() {
+            let damaged = || SecurityError::Damaged(path.clone());
+            let (name, value) = line.split_once(' ').ok_or_else(damaged)?;
+            if name == "address" {
+                value.clone_into(&mut tokens.address);
+            } else {
+                let role = name.parse().map_err(|_| damaged())?;
+                let hash = Hash::from_hex(value).map_err(|_| damaged())?;
+                tokens.hashes.push((role, hash));
+            }
+        }
+        Ok(tokens)
+    }
+
+    fn write(&self, folder: &Path) -> Result<(), SecurityError> {
+        let mut text = format!("address {}\n", self.address);
+        for (role, hash) in &self.hashes {
+            let hex = hash.to_hex();
+            text.extend([role.name(), " ", hex.as_str(), "\n"]);
+        }
+        write(&folder.join(TOKENS), &text)
+    }
+}
+
+/// Makes an authority and a certificate that it vouches for.
+fn make_certificates(folder: &Path) -> Result<(), SecurityError> {
+    let mut of_authority = CertificateParams::default();
+    of_authority.distinguished_name.push(DnType::CommonName, "rtfarm authority");
+    of_authority.is_ca = IsCa::Ca(BasicConstraints::Constrained(0));
+    of_authority.key_usages = vec![KeyUsagePurpose::KeyCertSign];
+    let key = KeyPair::generate()?;
+    let authority = of_authority.self_signed(&key)?;
+    write(&folder.join(AUTHORITY), &(authority.pem() + &key.serialize_pem()))?;
+    let issuer = Issuer::new(of_authority, key);
+
+    let mut shown = CertificateParams::new([CERTIFIED_NAME.to_owned()])?;
+    shown.distinguished_name.push(DnType::CommonName, CERTIFIED_NAME);
+    let key = KeyPair::generate()?;
+    let certificate = shown.signed_by(&key, &issuer)?;
+    write(&folder.join(CERTIFICATE), &(certificate.pem() + &key.serialize_pem()))
+}
+
+/// Writes a file that only its owner may read, beside its place, then renames it.
+fn write(path: &Path, text: &str) -> Result<(), SecurityError> {
+    let write = || -> io::Result<()> {
+        let folder = path.parent().unwrap_or(Path::new("."));
+        // Such a file has mode 0600.
+        let mut file = NamedTempFile::new_in(folder)?;
+        file.write_all(text.as_bytes())?;
+        file.as_file().sync_all()?;
+        file.persist(path)?;
+        Ok(())
+    };
+    write().map_err(|error| SecurityError::Io(path.to_owned(), error))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn address() -> Address {
+        "https://127.0.0.1:7878".parse().unwrap()
+    }
+
+    fn access(state: &Path, role: Role) -> Access {
+        let text = fs::read_to_string(state.join(FOLDER).join(role.name())).unwrap();
+        Access::read(&text).unwrap()
+    }
+
+    /// What becomes of a call with a token.
+    fn check(security: &Security, path: &str, token: &str) -> Option<Code> {
+        let shown = format!("Bearer {token}");
+        security.check(path, Some(shown.as_bytes())).err().map(|status| status.code())
+    }
+
+    #[test]
+    fn each_role_may_do_its_own_and_no_more() {
+        let all = ["Submit", "Watch", "Image", "Cancel", "List", "Control", "Workers", "Station"];
+        let may = |role: Role| -> Vec<&str> {
+            let jobs =
+                all.into_iter().filter(|method| role.may(&format!("/rtfarm.v1.Jobs/{method}")));
+            let work = role.may("/rtfarm.v1.Farm/Deliver").then_some("Deliver");
+            jobs.chain(work).collect()
+        };
+        assert_eq!(may(Role::Read), ["Watch", "Image", "List", "Workers"]);
+        assert_eq!(may(Role::Submit), all[..7]);
+        assert_eq!(may(Role::Work), ["Deliver"]);
+        assert_eq!(may(Role::Admin).len(), all.len() + 1);
+        assert!(!Role::Work.may("/") && !Role::Read.may("rtfarm.v1.Jobs"));
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn tokens_are_renewed_and_revoked_without_a_restart_and_kept_as_hashes() {
+        let state = tempfile::tempdir().unwrap();
+        let security = Security::open(state.path(), &address()).unwrap();
+        let submit = "/rtfarm.v1.Jobs/Submit";
+        let token = access(state.path(), Role::Submit).token().unwrap().to_owned();
+        assert_eq!(check(&security, submit, &token), None);
+        assert_eq!(check(&security, "/rtfarm.v1.Farm/Join", &token), Some(Code::PermissionDenied));
+        assert_eq!(check(&security, submit, "another"), Some(Code::Unauthenticated));
+        for shown in [None, Some(&b"Basic x"[..]), Some(token.as_bytes())] {
+            assert_eq!(security.check(submit, shown).unwrap_err().code(), Code::Unauthenticated);
+        }
+        let kept = fs::read_to_string(state.path().join("access/tokens")).unwrap();
+        assert!(!kept.contains(&token));
+
+        renew_token(state.path(), Role::Submit).unwrap();
+        let renewed = access(state.path(), Role::Submit).token().unwrap().to_owned();
+        tokio::time::advance(REREAD).await;
+        assert_eq!(check(&security, submit, &token), Some(Code::Unauthenticated));
+        assert_eq!(check(&security, submit, &renewed), None);
+        revoke_token(state.path(), Role::Submit).unwrap();
+        tokio::time::advance(REREAD).await;
+        assert_eq!(check(&security, submit, &renewed), Some(Code::Unauthenticated));
+
+        // The others are the same at the next start, and know the new address; the revoked stays so.
+        let elsewhere: Address = "https://elsewhere:1".parse().unwrap();
+        let again = Security::open(state.path(), &elsewhere).unwrap();
+        let worker = access(state.path(), Role::Work);
+        assert_eq!(worker.address(), &elsewhere);
+        assert_eq!(check(&again, "/rtfarm.v1.Farm/Join", worker.token().unwrap()), None);
+        assert!(!state.path().join("access/submit").exists());
+    }
+
+    #[test]
+    fn secrets_are_their_owners_alone() {
+        let state = tempfile::tempdir().unwrap();
+        Security::open(state.path(), &address()).unwrap();
+        let folder = state.path().join(FOLDER);
+        assert_eq!(fs::metadata(&folder).unwrap().mode() & 0o777, 0o700);
+        for entry in fs::read_dir(&folder).unwrap() {
+            let entry = entry.unwrap();
+            assert_eq!(entry.metadata().unwrap().mode() & 0o777, 0o600, "{entry:?}");
+        }
+        let given = fs::read_to_string(folder.join("work")).unwrap();
+        assert!(!given.contains("PRIVATE KEY"));
+    }
+}

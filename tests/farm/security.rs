@@ -1,0 +1,178 @@
+//! A farm that others can reach: who may come, and what becomes of those who may not.
+
+use std::{
+    io::{Read, Write},
+    net::TcpStream,
+    os::unix::fs::PermissionsExt,
+};
+
+use super::*;
+
+/// A farm with certificates and tokens, started; and its address.
+fn start_farm(place: &Place) -> (Process, String) {
+    let args = ["coordinator", "--listen", "127.0.0.1:0", "--state", "farm"];
+    let limits = ["--strangers", "4", "--greeting-seconds", "1", "--handshake-seconds", "1"];
+    let mut coordinator = place.start("coordinator.log", &[&args[..], &limits].concat());
+    let line = coordinator.read_line();
+    let url = line.trim().strip_prefix("listening on ").expect(&line).to_owned();
+    assert!(url.starts_with("https://127.0.0.1:"), "{url}");
+    (coordinator, url)
+}
+
+/// Runs a command to its end; answers with its exit code and what it said.
+fn ask(place: &Place, words: &[&str]) -> (Option<i32>, String) {
+    let mut process = place.start("ask.log", words);
+    let code = process.wait().code();
+    let mut said = process.log();
+    process.stdout.as_mut().unwrap().read_to_string(&mut said).unwrap();
+    (code, said)
+}
+
+#[test]
+fn a_farm_serves_those_who_have_a_token_while_others_storm_it() {
+    let place = Place::new();
+    let (mut coordinator, url) = start_farm(&place);
+    let address = url.strip_prefix("https://").unwrap().to_owned();
+    let picture = ["--size", "96x64", "--samples", "128", "--tile", "8"];
+    let here = place.render("here.png", &[&picture[..], &["--workers", "0"]].concat());
+    let worker = ["worker", "--threads", "1", "--access", "farm/access/work"];
+    let mut workers = [place.start("a.log", &worker), place.start("b.log", &worker)];
+    let submit = ["submit", "scene.rt", "-o", "out.png", "--access", "farm/access/submit"];
+    let mut submit = place.start("submit.log", &[&submit[..], &picture].concat());
+
+    // Some say nothing, some dribble, some talk nonsense, some more than anybody wants to hear.
+    let storm: Vec<_> = (0..12)
+        .map(|number| {
+            let address = address.clone();
+            thread::spawn(move || {
+                let Ok(mut stream) = TcpStream::connect(&address) else { return };
+                stream.set_read_timeout(Some(PATIENCE)).unwrap();
+                for byte in 0..8 {
+                    let said = match number % 4 {
+                        0 => Ok(()),
+                        1 => stream.write_all(&[0x16]),
+                        2 => stream.write_all(b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n"),
+                        _ => stream.write_all(&vec![byte; 1 << 20]),
+                    };
+                    if said.is_err() {
+                        return;
+                    }
+                    thread::sleep(Duration::from_millis(50));
+                }
+                // It is sent away: this ends before its patience does.
+                let _ = stream.read_to_end(&mut Vec::new());
+            })
+        })
+        .collect();
+    assert!(submit.wait().success(), "{}", submit.log());
+    assert!(fs::read(place.path("out.png")).unwrap() == here);
+    for stranger in storm {
+        stranger.join().unwrap();
+    }
+
+    let secrets: Vec<String> = ["work", "submit", "read", "admin"]
+        .map(|role| fs::read_to_string(place.path(&format!("farm/access/{role}"))).unwrap())
+        .iter()
+        .map(|text| text.lines().find_map(|line| line.strip_prefix("token ")).unwrap().to_owned())
+        .collect();
+    coordinator.signal(Signal::TERM);
+    assert_eq!(coordinator.wait().code(), Some(0), "{}", coordinator.log());
+    for worker in &mut workers {
+        assert!(worker.wait().success(), "sent home: {}", worker.log());
+        assert!(!secrets.iter().any(|secret| worker.log().contains(secret)));
+    }
+    assert!(!secrets.iter().any(|secret| coordinator.log().contains(secret)));
+    place.check_nothing_is_left();
+}
+
+#[test]
+fn who_has_no_token_or_that_of_another_role_or_farm_is_refused_and_told_why() {
+    let place = Place::new();
+    let (_coordinator, url) = start_farm(&place);
+    let other = Place::new();
+    let (_other, _) = start_farm(&other);
+    let foreign = fs::read(other.path("farm/access/admin")).unwrap();
+    let keep = |name: &str, text: &[u8], mode: u32| {
+        fs::write(place.path(name), text).unwrap();
+        fs::set_permissions(place.path(name), fs::Permissions::from_mode(mode)).unwrap();
+    };
+    let submit = fs::read_to_string(place.path("farm/access/submit")).unwrap();
+    keep("foreign", &foreign, 0o600);
+    keep("open", submit.as_bytes(), 0o644);
+    keep("guess", submit.replace("token ", "token 0").as_bytes(), 0o600);
+    keep("nonsense", b"hello", 0o600);
+    let of = |name: &str| format!("farm/access/{name}");
+    let order = ["submit", "scene.rt", "-o", "out.png", "--size", "32x32", "--access"];
+    for (words, code, reason) in [
+        (vec!["jobs", "--access", &of("work")], 1, "the token is one to work"),
+        (vec!["drain", "1", "--access", &of("submit")], 1, "the token is one to submit"),
+        (vec!["cancel", "1", "--access", &of("read")], 1, "the token is one to read"),
+        (vec!["jobs", "--access", "guess"], 1, "the token is not known"),
+        (vec!["jobs", "--access", "open"], 2, "others may read it; chmod 600"),
+        (vec!["jobs", "--access", "nonsense"], 2, "it is no access file of a farm"),
+        (vec!["jobs", "--access", "nowhere"], 2, "No such file"),
+        (vec!["jobs"], 2, "--access FILE"),
+        (vec!["jobs", "--coordinator", &url], 1, "needs an access file"),
+        ([&order[..], &[&of("read")]].concat(), 1, "the token is one to read"),
+        (
+            vec!["worker", "--access", &of("submit"), "--patience", "1"],
+            1,
+            "the token is one to submit",
+        ),
+        // Another farm's coordinator, and one that shows no certificate.
+        (
+            vec!["jobs", "--access", "foreign", "--coordinator", &url],
+            1,
+            "no coordinator answers at",
+        ),
+        (vec!["jobs", "--coordinator", &url.replace("https", "http")], 1, "error: "),
+    ] {
+        let (found, said) = ask(&place, &words);
+        assert_eq!(found, Some(code), "{words:?}: {said}");
+        assert!(said.contains(reason), "{words:?}: {said}");
+    }
+    for role in ["submit", "read", "admin"] {
+        let (code, said) = ask(&place, &["jobs", "--access", &of(role)]);
+        assert_eq!(code, Some(0), "{role}: {said}");
+    }
+
+    // A token that is renewed is another at once, and its successor is good.
+    let (code, said) = ask(&place, &["tokens", "renew", "submit", "--state", "farm"]);
+    assert_eq!((code, said.trim()), (Some(0), "farm/access/submit"));
+    keep("old", submit.as_bytes(), 0o600);
+    thread::sleep(Duration::from_millis(1100));
+    let (code, said) = ask(&place, &["jobs", "--access", "old"]);
+    assert!(code == Some(1) && said.contains("not any more"), "{said}");
+    assert_eq!(ask(&place, &["jobs", "--access", &of("submit")]).0, Some(0));
+    assert_eq!(ask(&place, &["tokens", "revoke", "read", "--state", "farm"]).0, Some(0));
+    check_refused(
+        &place,
+        &["tokens", "renew", "read", "--state", "tmp"],
+        1,
+        "there are no tokens in",
+    );
+}
+
+#[test]
+fn a_socket_in_a_folder_of_ones_own_needs_no_token_and_another_is_refused() {
+    let place = Place::new();
+    fs::create_dir(place.path("own")).unwrap();
+    fs::set_permissions(place.path("own"), fs::Permissions::from_mode(0o755)).unwrap();
+    let listen = ["coordinator", "--listen", "unix:own/socket"];
+    check_refused(&place, &listen, 2, "others may enter own");
+    for open in ["127.0.0.1:0", "[::1]:0", "0.0.0.0:0"] {
+        check_refused(
+            &place,
+            &["coordinator", "--listen", open],
+            2,
+            "--state DIR keeps certificates",
+        );
+    }
+    fs::set_permissions(place.path("own"), fs::Permissions::from_mode(0o700)).unwrap();
+    let mut coordinator = place.start("coordinator.log", &listen);
+    assert_eq!(coordinator.read_line().trim(), "listening on unix:own/socket");
+    let (code, said) = ask(&place, &["jobs", "--coordinator", "unix:own/socket"]);
+    assert_eq!(code, Some(0), "{said}");
+    coordinator.signal(Signal::TERM);
+    assert_eq!(coordinator.wait().code(), Some(0));
+}
