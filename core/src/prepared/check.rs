@@ -69,7 +69,8 @@ pub(super) fn check(view: &View<'_>) -> Result<(), &'static str> {
     }
     for planes in view.box_planes {
         let numbers = [planes.points.as_flattened(), planes.normals.as_flattened()];
-        ensure(numbers.into_iter().all(finite), "a parallelepiped")?;
+        let whole = numbers.into_iter().all(finite) && finite(&planes.surfaces);
+        ensure(whole, "a parallelepiped")?;
     }
     for leaf in view.leaves {
         let whole = finite(&leaf.center) && finite(&[leaf.radius]) && material(leaf.material);

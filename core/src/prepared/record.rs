@@ -356,6 +356,8 @@ pub(crate) struct BoxPlanes {
     pub(crate) points: [[f64; 6]; 3],
     /// The normals look outward.
     pub(crate) normals: [[f64; 6]; 3],
+    /// The numbers of their surfaces.
+    pub(crate) surfaces: [f64; 6],
 }
 
 impl BoxPlanes {
@@ -368,6 +370,7 @@ impl BoxPlanes {
         Self {
             points: side_by_side(&|axis, face| record(face).point[axis]),
             normals: side_by_side(&|axis, face| record(face).normal[axis] * faces[face].sign()),
+            surfaces: faces.map(|plane| f64::from(plane.surface().0)),
         }
     }
 }

@@ -225,12 +225,7 @@ impl<'a> Course<'a> {
             (stretch, stretch[1] - stretch[0] >= STEEP * 2.0 * leaf.radius)
         } else {
             let planes = &self.view.box_planes[leaf.surface as usize];
-            let leaves_it = leaf.planes.iter().any(|plane| plane.surface() == self.ray.leaving);
-            let (stretch, cosine) = if leaves_it {
-                self.plane_crossings(leaf).cross()
-            } else {
-                cross_box(&self.near, planes)
-            };
+            let (stretch, cosine) = cross_box(&self.near, -self.start, planes);
             (stretch, cosine >= STEEP)
         };
         let [enter, leave] = stretch;
@@ -240,10 +235,10 @@ impl<'a> Course<'a> {
         (is_steep && leave - enter > self.apart()).then_some(stretch)
     }
 
-    /// Two ends that are farther from each other than this are not in one doubt.
+    /// Two ends of sure stretches that are farther from each other than this are not in one doubt.
     #[inline(always)]
     pub(super) fn apart(&self) -> f64 {
-        self.solid.margin / 2.0
+        self.solid.margin / 1024.0
     }
 
     #[inline(always)]
@@ -256,25 +251,16 @@ impl<'a> Course<'a> {
         hit_sphere(&self.near, center, leaf.radius).unwrap_or(NOWHERE)
     }
 
-    /// Where the line crosses the planes of a parallelepiped. The one that the ray leaves is at its
-    /// start.
-    #[inline(never)]
-    fn plane_crossings(&self, leaf: &LeafRecord) -> PlaneCrossings {
-        let planes = &self.view.box_planes[leaf.surface as usize];
-        let mut crossings = PlaneCrossings::new(&self.near, planes);
-        for (t, plane) in crossings.t.iter_mut().zip(leaf.planes) {
-            if plane.surface() == self.ray.leaving {
-                *t = -self.start;
-            }
-        }
-        crossings
-    }
-
     /// The crossing at an end of a leaf's sure stretch, at `t` of the course.
     #[inline(always)]
     pub(super) fn sure_crossing(&self, number: u32, t: f64, enters: bool) -> Crossing {
         let leaf = &self.leaves[number as usize];
-        let face = if leaf.is_sphere() { 0 } else { self.plane_crossings(leaf).face(t, enters) };
+        let face = if leaf.is_sphere() {
+            0
+        } else {
+            let planes = &self.view.box_planes[leaf.surface as usize];
+            PlaneCrossings::new(&self.near, -self.start, planes).face(t, enters)
+        };
         Crossing { t: self.start + t, part: Part::new(number, face) }
     }
 }

@@ -35,6 +35,12 @@ struct Change {
     event: Event,
 }
 
+impl Change {
+    fn new(course: &Course<'_>, event: Event) -> Self {
+        Self { node: course.leaves[event.leaf as usize].node, event }
+    }
+}
+
 /// The most leaves of a solid that is walked through, with two ends each.
 const MOST_EVENTS: usize = SolidNodeRecord::BITS + 2;
 
@@ -70,7 +76,6 @@ impl Walk {
         let Some(count) = self.collect(course, touched, [*told, known]) else {
             return Walked::Unsure;
         };
-        let root = course.nodes.len() as u32 - 1;
         let apart = course.apart();
         let mut next = 0;
         while next < count && self.events[next].t <= known {
@@ -82,11 +87,10 @@ impl Walk {
             if end < count && self.events[end].t - event.t <= apart {
                 return Walked::Unsure;
             }
-            let crossed = if end == next + 1 {
-                let node = course.leaves[event.leaf as usize].node;
-                (self.turn(course.nodes, node) == root).then_some(event)
-            } else {
-                self.step(course, next..end)
+            let crossed = match end - next {
+                1 => self.turn_for(course, Change::new(course, event)),
+                2 => self.turn_for_both(course, event, self.events[next + 1]),
+                _ => self.turn_for_all(course, next..end),
             };
             if let Some(event) = crossed
                 && event.t > *told
@@ -111,7 +115,7 @@ impl Walk {
         touched: &[u32],
         [told, known]: [f64; 2],
     ) -> Option<usize> {
-        let (from, to) = (told - 2.0 * course.apart(), known + 2.0 * course.apart());
+        let (from, to) = (told - course.solid.margin, known + course.solid.margin);
         self.inside = 0;
         let (mut count, mut rest) = (0, 0);
         for &number in touched {
@@ -160,57 +164,109 @@ impl Walk {
         }
     }
 
-    /// The same for events in one place: they are one step of each operation that they come to. The
-    /// face is that of the first operand that made the operation change.
-    #[inline(never)]
-    fn step(&mut self, course: &Course<'_>, events: Range<usize>) -> Option<Event> {
-        let Self { events: all, inside, changes } = self;
-        changes.clear();
-        for &event in &all[events] {
-            let node = course.leaves[event.leaf as usize].node;
-            let at = changes.partition_point(|change| change.node < node);
-            changes.insert(at, Change { node, event });
+    /// Enters or leaves a node because of an event; that event if the ray crosses the solid's surface
+    /// with it.
+    #[inline(always)]
+    fn turn_for(&mut self, course: &Course<'_>, change: Change) -> Option<Event> {
+        let root = course.nodes.len() as u32 - 1;
+        (self.turn(course.nodes, change.node) == root).then_some(change.event)
+    }
+
+    /// The same for two events in one place, of which one or the other is at the crossing: they are
+    /// one step of the operation that they both come to.
+    #[inline(always)]
+    fn turn_for_both(&mut self, course: &Course<'_>, a: Event, b: Event) -> Option<Event> {
+        let nodes = course.nodes;
+        let (mut a, mut b) = (Change::new(course, a), Change::new(course, b));
+        loop {
+            // `a` is the one of which all is known that may change the operation above it.
+            if nodes[a.node as usize].parent > nodes[b.node as usize].parent {
+                (a, b) = (b, a);
+            }
+            let SolidNodeRecord { siblings, needed, parent, .. } = nodes[a.node as usize];
+            self.inside ^= 1 << a.node;
+            if nodes[b.node as usize].parent == parent {
+                self.inside ^= 1 << b.node;
+                let operation = &nodes[parent as usize];
+                let (changes, siblings) = if a.node < b.node {
+                    ([a, b], siblings)
+                } else {
+                    ([b, a], nodes[b.node as usize].siblings)
+                };
+                let event = self.joint_change(operation, parent, siblings, &changes)?;
+                return self.turn_for(course, Change { node: parent, event });
+            }
+            if self.inside & siblings != needed {
+                return self.turn_for(course, b);
+            }
+            a.node = parent;
         }
+    }
+
+    /// The same for any number of events in one place.
+    #[inline(never)]
+    fn turn_for_all(&mut self, course: &Course<'_>, events: Range<usize>) -> Option<Event> {
+        let mut changes = std::mem::take(&mut self.changes);
+        changes.clear();
+        changes.extend(self.events[events].iter().map(|&event| Change::new(course, event)));
+        changes.sort_unstable_by_key(|change| change.node);
+        let event = self.turn_changes(course, &mut changes);
+        self.changes = changes;
+        event
+    }
+
+    fn turn_changes(&mut self, course: &Course<'_>, changes: &mut Vec<Change>) -> Option<Event> {
+        let nodes = course.nodes;
         loop {
             // Nothing below the first of their parents is going to change any more.
-            let parent_of = |change: &Change| course.nodes[change.node as usize].parent;
+            let parent_of = |change: &Change| nodes[change.node as usize].parent;
             let parent = changes.iter().map(parent_of).min()?;
             let first = changes.iter().position(|change| parent_of(change) == parent)?;
-            let Change { node, event } = changes[first];
-            let SolidNodeRecord { siblings, needed, .. } = course.nodes[node as usize];
-            *inside ^= 1 << node;
-            if parent == NO_NODE {
-                return Some(event);
-            }
             let operands = changes[first..].iter().take_while(|it| parent_of(it) == parent);
-            let end = first + operands.count();
-            let (event, changes_parent) = if end == first + 1 {
-                (event, *inside & siblings == needed)
-            } else {
-                let operation = &course.nodes[parent as usize];
-                let others = changes[first + 1..end].iter();
-                *inside = others.fold(*inside, |inside, change| inside ^ 1 << change.node);
-                let is_inside = |node: u32| *inside >> node & 1 == 1;
-                let operands = siblings | 1 << node;
-                let enters = match operation.kind {
-                    SolidNodeKind::UNION => *inside & operands != 0,
-                    SolidNodeKind::INTERSECTION => *inside & operands == operands,
-                    _ => *inside & operands == 1 << operation.first_child,
-                };
-                let is_wanted = |change: &&Change| {
-                    let is_taken = operation.kind == SolidNodeKind::DIFFERENCE
-                        && change.node != operation.first_child;
-                    is_inside(change.node) == (enters ^ is_taken)
-                };
-                let chosen = changes[first..end].iter().find(is_wanted);
-                (chosen.map_or(event, |it| it.event), enters != is_inside(parent))
-            };
-            if changes_parent {
-                changes[first] = Change { node: parent, event };
-                changes.drain(first + 1..end);
-            } else {
-                changes.drain(first..end);
+            let group = first..first + operands.count();
+            for change in &changes[group.clone()] {
+                self.inside ^= 1 << change.node;
             }
+            if parent == NO_NODE {
+                return Some(changes[first].event);
+            }
+            let siblings = nodes[changes[first].node as usize].siblings;
+            let event = self.joint_change(
+                &nodes[parent as usize],
+                parent,
+                siblings,
+                &changes[group.clone()],
+            );
+            changes.splice(group, event.map(|event| Change { node: parent, event }));
         }
+    }
+
+    /// The event whose face is there if an operation changes because some of its operands did, which
+    /// were turned already, in file order: that of the first that made it change. `siblings` are the
+    /// other operands of the first one.
+    #[inline(always)]
+    fn joint_change(
+        &self,
+        operation: &SolidNodeRecord,
+        node: u32,
+        siblings: u64,
+        changes: &[Change],
+    ) -> Option<Event> {
+        let is_inside = |node: u32| self.inside >> node & 1 == 1;
+        let operands = siblings | 1 << changes[0].node;
+        let enters = match operation.kind {
+            SolidNodeKind::UNION => self.inside & operands != 0,
+            SolidNodeKind::INTERSECTION => self.inside & operands == operands,
+            _ => self.inside & operands == 1 << operation.first_child,
+        };
+        if enters == is_inside(node) {
+            return None;
+        }
+        let is_wanted = |change: &&Change| {
+            let is_taken =
+                operation.kind == SolidNodeKind::DIFFERENCE && change.node != operation.first_child;
+            is_inside(change.node) == (enters ^ is_taken)
+        };
+        changes.iter().find(is_wanted).map(|change| change.event)
     }
 }
