@@ -18,7 +18,6 @@ use rtfarm_job::{Order, Outcome, RenderRequest};
 use rtfarm_picture::{Cache, Disk, PictureFormat};
 use rtfarm_proto::{JobId, LeaseName, WorkerId, pixels_to_bytes};
 use tempfile::TempDir;
-use tokio::sync::oneshot;
 
 use crate::{
     farm::{Delivery, Keeping, Next, Verdict},
@@ -95,22 +94,17 @@ impl Coordinator {
         }
     }
 
-    /// Brings a tile and makes it safe. Says whether it is acknowledged.
-    fn deliver(&self, tile: (LeaseName, TileId)) -> bool {
-        let verdicts = self.bring(tile);
-        self.shell.sync();
-        verdicts.is_some_and(|mut verdicts| verdicts.try_recv() == Ok(vec![Verdict::Accepted]))
-    }
-
-    /// Brings a tile, whose every pixel has its number.
-    fn bring(&self, (lease, tile): (LeaseName, TileId)) -> Option<oneshot::Receiver<Vec<Verdict>>> {
-        let (_, job) = self.shell.tile(lease.job, tile.number())?;
+    /// Brings a tile, whose every pixel has its number. Says whether it is acknowledged.
+    fn deliver(&self, (lease, tile): (LeaseName, TileId)) -> bool {
+        let Some((_, job)) = self.shell.tile(lease.job, tile.number()) else { return false };
         let pixels = vec![[tile.number() as f32 / 9.0; 3]; job.grid.area(tile).pixel_count()];
         let pixels = pixels_to_bytes(pixels);
         let hash = job.hasher.hash(tile, &pixels);
         let tally = Tally { rays: 64, ..Tally::default() };
         let delivery = Delivery { worker: self.worker, lease, tile, hash, seconds: 0.1, tally };
-        Some(self.shell.deliver(vec![(delivery, pixels)]))
+        let mut verdicts = self.shell.deliver(vec![(delivery, pixels)]);
+        self.shell.sync();
+        verdicts.try_recv().is_ok_and(|verdicts| verdicts == [Verdict::Accepted])
     }
 
     /// Renders all there is; answers with what was acknowledged.
@@ -251,25 +245,30 @@ async fn a_power_cut_at_any_change_takes_nothing_that_was_said_to_be_safe() {
 }
 
 #[tokio::test]
-async fn what_counts_as_done_after_a_kill_outlives_a_power_cut() {
+async fn what_a_start_has_found_outlives_a_power_cut_though_the_start_before_was_killed() {
     for durability in DURABILITIES {
-        let (folder, cache) = (folder_in_memory(), Cache::default());
-        let path = folder.path().join("state");
-        let open = || {
-            let disk = Disk::default().with_cache(&cache);
-            Coordinator::open(disk, &path, durability).unwrap()
-        };
-        let done = |farm: &Coordinator| farm.shell.job(JobId(1)).unwrap().canvas.done().unwrap();
-        let farm = open();
-        farm.shell.submit(order(), Ticket::default()).unwrap();
-        farm.bring(farm.lease().await[0]).expect("the job is there");
-        drop(farm);
-        let farm = open();
-        let before = done(&farm);
-        assert_eq!(before.len(), 1, "a kill takes nothing that was written");
-        drop(farm);
-        cache.cut_power(|| true);
-        assert_eq!(done(&open()), before, "a power cut takes nothing that counted as done");
+        for change in 0.. {
+            let (folder, cache) = (folder_in_memory(), Cache::default());
+            let path = folder.path().join("state");
+            let disk = Disk::stopping_at(change).with_cache(&cache);
+            work(&path, disk.clone(), durability).await;
+            let found = || {
+                let disk = Disk::default().with_cache(&cache);
+                let farm = Coordinator::open(disk, &path, durability).unwrap();
+                let jobs = (1..=2).filter_map(|id| farm.shell.job(JobId(id)));
+                let look = |job: Arc<Job>| {
+                    let has_ended = job.progress().borrow().outcome.is_some();
+                    (job.id, has_ended, job.canvas.done().unwrap())
+                };
+                jobs.map(look).collect::<Vec<_>>()
+            };
+            let before = found();
+            cache.cut_power(|| true);
+            assert_eq!(found(), before, "change {change}, {durability:?}");
+            if !disk.has_failed() {
+                break;
+            }
+        }
     }
 }
 

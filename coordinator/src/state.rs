@@ -200,6 +200,8 @@ impl StateFolder {
         let folder = self.path.join(JOBS);
         let io = |error| StateError::Io(folder.clone(), error);
         let mut jobs = Vec::new();
+        // What is found here counts as safe, and the process before may not have come to it.
+        self.disk.sync_folder(&folder).map_err(io)?;
         for entry in fs::read_dir(&folder).map_err(io)? {
             let entry = entry.map_err(io)?;
             let name = entry.file_name().into_string().unwrap_or_default();
@@ -217,6 +219,7 @@ impl StateFolder {
         let damaged = |name: &str, error: &dyn ToString| {
             StateError::Damaged(path.join(name), error.to_string())
         };
+        self.disk.sync_folder(path).map_err(|error| damaged("", &error))?;
         let record: JobRecord = read_record(&path.join(JOB))?;
         let of_record = |error: RecordError| damaged(JOB, &error);
         let plan = record.plan().map_err(of_record)?;
@@ -252,7 +255,6 @@ impl StateFolder {
             if opened.hash() != hash {
                 return Err(damaged(SCENE, &"it is another scene"));
             }
-            // The process before may not have come to it, and what is done here counts as safe.
             canvas.sync().map_err(|error| damaged("", &error))?;
             done = canvas.done().map_err(|error| damaged("", &error))?;
         }

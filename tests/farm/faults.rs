@@ -305,6 +305,11 @@ impl Farm<'_> {
     fn mend(&mut self, fault: Fault) {
         self.faults.remove(&fault);
         match fault {
+            // On a full disk no coordinator starts, and it says so.
+            // On a full disk no coordinator starts.
+            Fault::CoordinatorKilled if self.faults.contains_key(&Fault::DiskFull) => {
+                self.faults.insert(fault, self.faults[&Fault::DiskFull]);
+            }
             Fault::WorkerKilled(worker) => self.start_worker(worker),
             Fault::CoordinatorKilled => self.start_coordinator(),
             Fault::WorkerStopped(_) | Fault::CoordinatorStopped => {
@@ -406,7 +411,8 @@ fn pictures_come_out_the_same_under_faults() {
             }
             thread::sleep(Duration::from_millis(20));
         }
-        for fault in farm.faults.clone().into_keys() {
+        // The disk before the coordinator.
+        for fault in farm.faults.clone().into_keys().rev() {
             farm.mend(fault);
         }
         // The order in work ends, and one more ends well.
