@@ -9,6 +9,8 @@ use rtfarm_proto::{
     wire::{self, farm_client::FarmClient, lease_response::Next},
 };
 
+use tokio::sync::oneshot;
+
 use super::*;
 
 /// What the liar says of itself when it joins.
@@ -25,8 +27,10 @@ fn introduction() -> wire::JoinRequest {
 }
 
 /// Joins, and brings grey tiles with the right hashes until nobody wants them any more. Answers with how
-/// many were taken, and why it was refused in the end.
-async fn lie(url: &str) -> (usize, tonic::Status) {
+/// many were taken, and why it was refused in the end. Once some were taken it waits until others are there,
+/// who know better: alone it would finish the picture.
+async fn lie(url: &str, others: oneshot::Receiver<()>) -> (usize, tonic::Status) {
+    let mut others = Some(others);
     let address: Address = url.parse().unwrap();
     let mut client = FarmClient::new(address.connect().await.unwrap());
     let joined = client.join(introduction()).await.unwrap().into_inner();
@@ -69,6 +73,11 @@ async fn lie(url: &str) -> (usize, tonic::Status) {
         let verdicts = client.deliver(request).await.unwrap().into_inner().verdicts;
         let is_taken = |verdict: &&i32| **verdict == i32::from(wire::Verdict::Accepted);
         accepted += verdicts.iter().filter(is_taken).count();
+        if accepted >= 4
+            && let Some(others) = others.take()
+        {
+            others.await.unwrap();
+        }
     }
 }
 
@@ -84,14 +93,16 @@ fn a_worker_that_lies_is_kept_out_also_by_the_next_coordinator_and_leaves_no_pix
     let runtime = tokio::runtime::Runtime::new().unwrap();
     let submit = ["submit", "scene.rt", "-o", "out.png", "--coordinator", &url];
     let mut submit = place.start("submit.log", &[&submit[..], &picture].concat());
+    let (tell, others_are_there) = oneshot::channel();
     let liar = runtime.spawn({
         let url = url.clone();
-        async move { lie(&url).await }
+        async move { lie(&url, others_are_there).await }
     });
-    // It has brought some when the others come who know better.
     poll(|| (coordinator.tiles_done() >= 4).then_some(()));
     let worker = ["worker", "--threads", "1", "--coordinator", &url];
     let workers = ["a.log", "b.log"].map(|log| place.start(log, &worker));
+    poll(|| coordinator.log().contains("worker joined worker=3").then_some(()));
+    tell.send(()).unwrap();
     assert!(submit.wait().success(), "{}", submit.log());
     assert!(fs::read(place.path("out.png")).unwrap() == here, "{}", coordinator.log());
     let (accepted, refusal) = runtime.block_on(liar).unwrap();
