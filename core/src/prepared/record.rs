@@ -349,7 +349,7 @@ impl LeafRecord {
     }
 }
 
-/// The planes of a parallelepiped side by side: [axis][face], as its faces look.
+/// The planes of a parallelepiped side by side: `[axis][face]`, as its faces look.
 #[derive(Debug, Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
 #[repr(C)]
 pub(crate) struct BoxPlanes {
