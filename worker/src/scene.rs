@@ -56,8 +56,8 @@ impl From<Status> for SceneError {
     }
 }
 
-/// Brings the scene of a job here. Every sign of progress is a `beat`; no piece of the scene may take
-/// the coordinator longer than `silence`. Only a coordinator that is certainly on this machine,
+/// Brings the scene of a job here. Every sign of progress is a `beat`; neither a connection nor a
+/// piece of the scene may take longer than `silence`. Only a coordinator that is certainly on this machine,
 /// `is_local`, can know where the scene is here.
 pub(crate) async fn bring<C: Connection>(
     job: &Job,
@@ -69,8 +69,9 @@ pub(crate) async fn bring<C: Connection>(
     match &job.scene_path {
         Some(path) if is_local => find(path),
         _ => {
-            let client = connect().await.map_err(SceneError::Gone)?;
-            fetch(job, silence, client, beat).await
+            let late = |_| SceneError::Gone("no connection came about".to_owned());
+            let connected = tokio::time::timeout(silence, connect()).await.map_err(late)?;
+            fetch(job, silence, connected.map_err(SceneError::Gone)?, beat).await
         }
     }
 }
@@ -140,24 +141,37 @@ mod tests {
     };
     use rtfarm_proto::{Address, Incarnation, JobId, TileHasher};
     use rustix::fs::{CWD, FileType, Mode, mknodat};
-    use tonic::transport::Endpoint;
+    use tonic::transport::{Channel, Endpoint};
 
     use super::*;
 
-    /// What comes of a job whose scene is said to be at `path`, with a coordinator that is gone.
-    async fn bring_from(path: &Path, is_local: bool) -> Result<File, SceneError> {
+    fn job(scene_path: Option<Arc<Path>>) -> Job {
         let size = Size::new(16, 16).unwrap();
         let settings = Settings { size, quality: Quality::default() };
         let grid = TileGrid::new(size, 16).unwrap();
-        let job = Job {
+        Job {
             incarnation: Incarnation(1),
             scene: SceneHash([0; 32]),
             scene_byte_count: 1,
-            scene_path: Some(path.into()),
+            scene_path,
             settings,
             grid,
             hasher: TileHasher::new(JobId(1), SceneHash([0; 32]), settings, grid),
-        };
+        }
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn a_connection_that_does_not_come_about_is_given_up() {
+        let never = async || std::future::pending::<Result<FarmClient<Channel>, String>>().await;
+        let job = job(None);
+        let brought = bring(&job, false, Duration::from_secs(20), never, &|| {});
+        let brought = tokio::time::timeout(Duration::from_secs(21), brought).await;
+        assert!(matches!(brought, Ok(Err(SceneError::Gone(_)))), "{brought:?}");
+    }
+
+    /// What comes of a job whose scene is said to be at `path`, with a coordinator that is gone.
+    async fn bring_from(path: &Path, is_local: bool) -> Result<File, SceneError> {
+        let job = job(Some(path.into()));
         let nowhere = Address::Tcp("127.0.0.1:1".to_owned()).to_string();
         let client = FarmClient::new(Endpoint::from_shared(nowhere).unwrap().connect_lazy());
         bring(&job, is_local, Duration::from_secs(20), async || Ok(client), &|| {}).await
