@@ -205,6 +205,9 @@ struct World {
     is_broken: CancellationToken,
 }
 
+/// A disk makes fewer changes.
+const NEVER: u64 = 1 << 60;
+
 /// Tells when its task panics, which the runtime would keep to itself.
 struct Witness(Arc<World>);
 
@@ -314,6 +317,7 @@ impl World {
     fn kill_coordinator(&self) {
         if let Some(start) = self.current.lock().unwrap().take() {
             start.over.cancel();
+            start.disk.stop();
         }
     }
 
@@ -330,7 +334,7 @@ impl World {
     fn start_coordinator(&self) -> Result<Arc<Start>, crate::StateError> {
         let count = self.ledger().restarts;
         let is_to_stop = self.durability.is_some() && self.goes_wrong(Fault::KilledInAWrite, 3);
-        let disk = if is_to_stop { Disk::stopping_at(self.below(150)) } else { Disk::default() };
+        let disk = Disk::stopping_at(if is_to_stop { self.below(150) } else { NEVER });
         let disk = disk.with_cache(&self.cache);
         let path = self.folder.path().join("state");
         let folder = self

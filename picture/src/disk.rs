@@ -79,6 +79,14 @@ impl Disk {
         Self { cache: Some(cache.clone()), ..self }
     }
 
+    /// Stops a test's disk now, unless it makes every change: what its killed process does later has no
+    /// effect.
+    pub fn stop(&self) {
+        if let Some(fault) = &self.fault {
+            fault.made.store(fault.at + 1, Ordering::SeqCst);
+        }
+    }
+
     /// Says whether a test's disk has come to the change that fails.
     pub fn has_failed(&self) -> bool {
         self.fault.as_ref().is_some_and(|fault| fault.made.load(Ordering::SeqCst) > fault.at)
