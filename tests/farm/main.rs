@@ -4,6 +4,7 @@
 mod faults;
 mod frames;
 mod liar;
+mod page;
 mod queue;
 mod security;
 
@@ -11,7 +12,7 @@ use std::{
     collections::BTreeSet,
     fs::{self, File},
     io::{BufRead, BufReader},
-    net::TcpListener,
+    net::{TcpListener, TcpStream},
     path::{Path, PathBuf},
     process::{Child, ChildStdout, Command, ExitStatus, Stdio},
     thread,
