@@ -20,6 +20,7 @@ mod render;
 mod report;
 mod resume;
 mod scene_files;
+mod slurm;
 mod source;
 mod submit;
 mod worker;

@@ -6,6 +6,7 @@ mod frames;
 mod liar;
 mod queue;
 mod security;
+mod slurm;
 
 use std::{
     collections::BTreeSet,

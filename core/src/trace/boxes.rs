@@ -6,7 +6,10 @@
 
 use glam::DVec3;
 
-use super::lanes::{self, Beam, Crossings, GROUPS, LANES, RayGroup, larger, smaller};
+use super::{
+    lanes::{self, Beam, Crossings, GROUPS, LANES, RayGroup, Turn, larger, smaller},
+    ray::Ray,
+};
 use crate::{
     exact::float::{above, below},
     prepared::node::{Frame, Node},
@@ -28,10 +31,10 @@ pub(super) struct BoxRay {
     pub(super) low: f32,
     pub(super) high: f32,
     /// Turns a distance along the ray into the boxes' frame: (t - start) · scale.
-    start: f64,
-    scale: f64,
+    pub(super) start: f64,
+    pub(super) scale: f64,
     /// What f64 rounding may have taken from a hit's distance, in the boxes' frame.
-    slack: f64,
+    pub(super) slack: f64,
 }
 
 /// Far planes are moved out by 4 ulp: 2 for the rounding of f32 (Ize 2013), the rest covers that
@@ -39,7 +42,7 @@ pub(super) struct BoxRay {
 pub(super) const FAR: f32 = 1.0 + 4.0 * f32::EPSILON;
 
 /// Three f32 roundings may move a near plane by 1.5 ulp away: so much more is within reach.
-const NEAR: f64 = 2.0 * f32::EPSILON as f64;
+pub(super) const NEAR: f64 = 2.0 * f32::EPSILON as f64;
 
 /// A ray that starts nearer to its frame than this is taken as it is.
 pub(super) const NEAR_FRAME: f64 = 8.0;
@@ -180,6 +183,22 @@ pub(super) trait BoxKernel: Copy {
     fn plain(self) -> Self::Plain;
 
     fn test(self, node: &Node, ray: &BoxRay) -> ([f32; 8], u32);
+
+    /// The classes of rays, as [`lanes::class_of`] tells them.
+    #[inline(always)]
+    fn classify(self, rays: [&Ray; 4], frame: &Frame) -> [u64; 4] {
+        let mut classes = [0; 4];
+        for (class, ray) in classes.iter_mut().zip(rays) {
+            *class = lanes::class_of(ray, frame);
+        }
+        classes
+    }
+
+    /// Makes a group of rays of one class. Every number is that of [`BoxRay::new`] and `Shear::new`.
+    #[inline(always)]
+    fn fill(self, group: &mut RayGroup, rays: [&Ray; LANES], turn: &Turn) {
+        lanes::fill(group, rays, turn);
+    }
 
     /// Which rays of a mask meet the box between three near and three far planes, as
     /// [`BoxKernel::test`] tells it for each.
