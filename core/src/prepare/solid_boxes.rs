@@ -3,7 +3,7 @@
 use glam::DVec3;
 
 use super::{
-    bvh::{Bounds, BuildPrimitive, build_bvh},
+    bvh::{BuildPrimitive, build_bvh},
     solid_trees::node_bounds,
 };
 use crate::{
@@ -54,15 +54,12 @@ pub(super) fn enclose_leaves(
     let relative = |point: DVec3| ((point - middle) * scale).to_array();
     let mut primitives: Vec<BuildPrimitive> = (0..)
         .zip(leaves)
-        .map(|(item, leaf)| {
+        .filter_map(|(item, leaf)| {
             let (min, max) = bounds[leaf.node as usize];
             let min = relative(min - solid.margin).map(below);
             let max = relative(max + solid.margin).map(above);
-            BuildPrimitive { bounds: Bounds { min, max }, item }
-        })
-        .filter(|primitive| {
-            let Bounds { min, max } = primitive.bounds;
-            (0..3).all(|axis| min[axis] <= max[axis])
+            let counts = (0..3).all(|axis| min[axis] <= max[axis]);
+            counts.then(|| BuildPrimitive::new(min, max, item))
         })
         .collect();
     let built = build_bvh(&mut primitives, 0);
@@ -70,7 +67,7 @@ pub(super) fn enclose_leaves(
     boxes.extend(built.into_iter().map(|mut node| {
         node.children = node.children.map(|child| {
             if child.is_leaf() {
-                Child::leaf(primitives[child.items().start].item as usize, 1)
+                Child::leaf(primitives[child.items().start].item() as usize, 1)
             } else {
                 child.moved_by(solid.first_box as usize)
             }

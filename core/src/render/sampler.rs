@@ -241,7 +241,7 @@ impl<'a> Sampler<'a> {
                         CameraSample { x, y, sample, width }
                     })
                 });
-                self.wavefront.start(self.view, self.quality, area.frame(), samples);
+                self.wavefront.start(self.view, self.quality, self.isa, area.frame(), samples);
                 self.tally.samples += (pixels.len() * part.len()) as u64;
                 self.tally.rays +=
                     self.wavefront.run(self.view, self.quality, self.isa, self.on_progress)?;

@@ -222,11 +222,11 @@ impl BoxKernel for Avx2Boxes {
             let splat =
                 |x: [f32; 3]| [_mm256_set1_ps(x[0]), _mm256_set1_ps(x[1]), _mm256_set1_ps(x[2])];
             let (near, far) = (splat(near), splat(far));
-            for (k, group) in groups.iter().enumerate() {
-                let asking = mask >> (LANES * k) & 0xFF;
-                if asking == 0 {
-                    continue;
-                }
+            let mut left = mask;
+            while left != 0 {
+                let k = left.trailing_zeros() as usize / LANES % GROUPS;
+                let (group, asking) = (&groups[k], left >> (LANES * k) & 0xFF);
+                left &= !(0xFF << (LANES * k));
                 let mut enter = _mm256_set1_ps(-0.0);
                 let mut leave = _mm256_load_ps(group.high.as_ptr());
                 for axis in 0..3 {
@@ -282,11 +282,11 @@ impl BoxKernel for Avx2Boxes {
     ) -> Crossings {
         let mut crossings = Crossings::default();
         // Half a group at a time.
-        for half in 0..2 * GROUPS {
-            let asking = mask >> (4 * half) & 0xF;
-            if asking == 0 {
-                continue;
-            }
+        let mut left = mask;
+        while left != 0 {
+            let half = left.trailing_zeros() as usize / 4 % (2 * GROUPS);
+            let asking = left >> (4 * half) & 0xF;
+            left &= !(0xF << (4 * half));
             let (group, first) = (&groups[half / 2], 4 * (half % 2));
             // SAFETY: a value of this type says that the CPU has AVX2. The loads and the store
             // take 4 of 8 numbers, from the first or from the fifth on.
@@ -345,6 +345,7 @@ impl BoxKernel for Avx2Boxes {
     }
 }
 
+#[expect(clippy::unused_self, reason = "a value says that the CPU has the instructions")]
 impl Avx2Boxes {
     /// The numbers of four rays side by side: starts, directions, reaches, and bits that mean no
     /// number.

@@ -1,6 +1,6 @@
 //! The choice of the kernel that an instruction set has.
 
-use super::boxes::{KernelWork, ScalarBoxes};
+use super::boxes::{BoxKernel, KernelWork, ScalarBoxes};
 #[cfg(target_arch = "x86_64")]
 use super::boxes_x86::{Avx2Boxes, Sse2Boxes};
 use crate::isa::Isa;
@@ -17,6 +17,25 @@ pub(super) fn run_with_kernel<Input>(isa: Isa, input: &Input, work: &mut impl Ke
         #[cfg(not(target_arch = "x86_64"))]
         Isa::Sse2 | Isa::Avx2 => panic!("{LACKING}"),
     }
+}
+
+/// Work on numbers side by side, in plain Rust, that is compiled once for each instruction set.
+pub(crate) trait LaneWork {
+    fn run(&mut self);
+}
+
+struct WithAnyKernel<'a, W>(&'a mut W);
+
+impl<W: LaneWork> KernelWork<()> for WithAnyKernel<'_, W> {
+    #[inline(always)]
+    fn run(&mut self, (): &(), _kernel: impl BoxKernel) {
+        self.0.run();
+    }
+}
+
+/// Does work with an instruction set, which this CPU must have.
+pub(crate) fn run_in_lanes(isa: Isa, work: &mut impl LaneWork) {
+    run_with_kernel(isa, &(), &mut WithAnyKernel(work));
 }
 
 #[cfg(test)]

@@ -7,7 +7,7 @@ mod boxes;
 mod boxes_x86;
 mod course;
 mod hit;
-mod kernels;
+pub(crate) mod kernels;
 mod lanes;
 mod packet;
 mod parallelepiped;

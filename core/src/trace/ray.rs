@@ -36,6 +36,15 @@ const _: () = assert!(offset_of!(Ray, reach) == 48 && offset_of!(Ray, leaving) =
 impl Ray {
     /// No face comes later than this.
     pub(crate) const NOTHING_AHEAD: u32 = u32::MAX;
+
+    /// A ray that meets nothing.
+    pub(crate) const NOWHERE: Self = Self {
+        origin: DVec3::NAN,
+        direction: DVec3::NAN,
+        reach: 0.0,
+        leaving: Surface::NONE,
+        after: Self::NOTHING_AHEAD,
+    };
 }
 
 /// The nearest face along a ray: the smallest (t, rank).
