@@ -343,6 +343,12 @@ pub(crate) struct RenderArgs {
     #[arg(long, value_name = "S", default_value = "60", value_parser = parse_seconds, help_heading = WORK)]
     pub(crate) patience: Duration,
 
+    /// Show the picture as it comes, on a page of this user's browser.
+    ///
+    /// Where none can be opened, the page's address is told.
+    #[arg(long, help_heading = TALK)]
+    pub(crate) show: bool,
+
     /// How log lines are written.
     #[arg(long, value_name = "FORMAT", default_value = "text", help_heading = TALK)]
     pub(crate) log_format: LogFormat,
@@ -369,7 +375,11 @@ pub(crate) struct CoordinatorArgs {
     #[arg(long, requires = "state", env = "RTFARM_DURABLE")]
     pub(crate) durable: bool,
 
-    /// Where others find the coordinator, for the access files; by default this machine's name, or the
+    /// Append what happens to this file, a JSON object a line.
+    #[arg(long, value_name = "FILE", env = "RTFARM_EVENTS", help_heading = TALK)]
+    pub(crate) events: Option<PathBuf>,
+
+    /// Where others find the coordinator, for the access files and the page; by default this machine's name, or the
     /// address that is listened on.
     #[arg(long, value_name = "HOST", env = "RTFARM_NAME", help_heading = LIMITS)]
     pub(crate) name: Option<String>,

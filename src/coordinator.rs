@@ -61,13 +61,19 @@ pub(crate) async fn run(
             byte_count: u64::from(args.keep_gb) * 1_000_000_000,
         },
         upload_silence: args.upload_seconds,
+        events: args.events.clone(),
+        host: Some(args.name.clone().unwrap_or_else(own_name)),
         scene_folder: folder.clone(),
         picture_folder: folder,
     };
     let coordinator = match state {
-        Some(state) => Coordinator::with_state(config, state)?,
-        None => Coordinator::new(config)?,
+        Some(state) => Coordinator::with_state(config, state),
+        None => Coordinator::new(config),
     };
+    let coordinator = coordinator.with_context(|| match &args.events {
+        Some(path) => format!("cannot start with events in {}", path.display()),
+        None => "cannot start".to_owned(),
+    })?;
     coordinator.run(listener, stop.cancelled()).await?;
     if terminate.is_cancelled() { Ok(()) } else { Err(Failure::Interrupted) }
 }
@@ -134,9 +140,7 @@ impl Place {
         };
         let host = match &args.name {
             Some(name) => name.clone(),
-            None if address.ip().is_unspecified() => {
-                rustix::system::uname().nodename().to_string_lossy().into_owned()
-            }
+            None if address.ip().is_unspecified() => own_name(),
             None if address.is_ipv6() => format!("[{}]", address.ip()),
             None => address.ip().to_string(),
         };
@@ -145,6 +149,11 @@ impl Place {
         tracing::info!(folder = %state.join("access").display(), "access files are there");
         Ok((Listener::Tls(listener, security, args.limits()), shown))
     }
+}
+
+/// What this machine calls itself.
+fn own_name() -> String {
+    rustix::system::uname().nodename().to_string_lossy().into_owned()
 }
 
 /// `rtfarm tokens`.

@@ -20,6 +20,7 @@ mod render;
 mod report;
 mod resume;
 mod scene_files;
+mod show;
 mod slurm;
 mod source;
 mod submit;

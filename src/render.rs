@@ -19,7 +19,12 @@ use rtfarm_core::{
 use rtfarm_job::{Order, Outcome, Progress, Refusal};
 use rtfarm_picture::{Canvas, Picture};
 use rtfarm_proto::Address;
-use tokio::{net::UnixListener, sync::watch, task::spawn_blocking, time::Instant};
+use tokio::{
+    net::UnixListener,
+    sync::watch,
+    task::spawn_blocking,
+    time::{Instant, sleep},
+};
 use tokio_util::sync::CancellationToken;
 
 use crate::{
@@ -36,9 +41,12 @@ use crate::{
     private_folder::PrivateFolder,
     resume::{Begun, Resume},
     scene_files::SceneFiles,
-    slurm,
+    show, slurm,
     source::SceneText,
 };
+
+/// So long those who watch a picture on its page see that it is finished.
+const LAST_LOOK: Duration = Duration::from_millis(700);
 
 /// What there is to say about a finished render.
 #[derive(Debug)]
@@ -177,6 +185,11 @@ pub(crate) async fn run(
     stop: &CancellationToken,
 ) -> Result<(), Failure> {
     let started = Instant::now();
+    if args.show && args.workers_and_threads().0 == 0 {
+        return Err(Failure::Input(anyhow!(
+            "--show is a coordinator's, and with --workers 0 there is none"
+        )));
+    }
     let pictures = match args.frames {
         Some(frames) => frames.pictures(&args.picture).map_err(Failure::Input)?,
         None => vec![args.picture.clone()],
@@ -298,6 +311,10 @@ impl Render<'_> {
         };
         write_picture(&output, self.stop, picture).await?;
         if let (Some(coordinator), Some(job)) = (&self.coordinator, job) {
+            if self.args.show {
+                // Who watches sees the end.
+                sleep(LAST_LOOK).await;
+            }
             coordinator.cancel(job);
         }
         if let Some(resume) = resume {
@@ -382,10 +399,15 @@ impl Render<'_> {
             audit: if is_here { 0.0 } else { AUDIT },
             keeping: Keeping::default(),
             upload_silence: UPLOAD_SILENCE,
+            events: None,
+            host: None,
             scene_folder: folder.path().to_owned(),
             picture_folder: first.output.folder(),
         })?;
         self.coordinator = Some(coordinator.clone());
+        if self.args.show {
+            show::show(&coordinator, folder.path(), self.console).await?;
+        }
         let stop_serving = CancellationToken::new();
         let serving = tokio::spawn({
             let (coordinator, stop) = (coordinator.clone(), stop_serving.clone());

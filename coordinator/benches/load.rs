@@ -86,6 +86,8 @@ async fn run(load: Load, folder: PathBuf) -> Result<(), Error> {
         audit: 0.0,
         term: Duration::from_secs(60),
         upload_silence: Duration::from_secs(30),
+        events: None,
+        host: None,
         scene_folder: scenes.path().to_owned(),
         picture_folder: folder,
         keeping: Keeping::default(),

@@ -84,8 +84,8 @@ struct JobState {
     /// Tiles of which such pixels came: who brought the last, under which lease.
     senseless: BTreeMap<TileId, (WorkerId, LeaseId)>,
     storing: BTreeMap<TileId, Storing>,
-    /// What the tiles in the picture took that came since this start, in the order of coming.
-    tallies: Vec<(TileId, Tally)>,
+    /// The tiles in the picture that came since this start, in the order of coming.
+    brought: Vec<Delivery>,
     /// Tiles of which copies differ, and nobody could say which is right.
     unsettled: BTreeSet<TileId>,
 }
@@ -258,17 +258,17 @@ impl JobState {
             suspects: BTreeSet::new(),
             senseless: BTreeMap::new(),
             storing: BTreeMap::new(),
-            tallies: Vec::new(),
+            brought: Vec::new(),
             unsettled: BTreeSet::new(),
         }
     }
 
     /// Counts no more what tiles took that are out of the picture again.
     fn forget_tallies(&mut self, taken: &BTreeSet<TileId>) {
-        self.tallies.retain(|(tile, _)| !taken.contains(tile));
+        self.brought.retain(|delivery| !taken.contains(&delivery.tile));
         self.progress.tally = self.earlier.tally;
-        for (_, tally) in &self.tallies {
-            self.progress.tally.add(tally);
+        for delivery in &self.brought {
+            self.progress.tally.add(&delivery.tally);
         }
     }
 
@@ -753,7 +753,7 @@ impl Farm {
         self.members.on_tile(worker);
         job.progress.tiles_done = done;
         job.progress.tally.add(&delivery.tally);
-        job.tallies.push((tile, delivery.tally));
+        job.brought.push(delivery);
         job.progress.worker_count = job.earlier.worker_count.max(job.contributors.len() as u32);
         let (progress, elapsed) = (job.progress.clone(), job.elapsed(now));
         let mut actions = vec![Action::Acknowledge(storing.id, Verdict::Accepted)];
@@ -1057,9 +1057,11 @@ impl Farm {
 
 mod queue;
 mod trust;
+mod watching;
 
 pub use queue::Keeping;
 pub(crate) use queue::{Change, JobEntry, Phase as JobPhase, Refused, Terms};
+pub(crate) use watching::Arrived;
 
 #[cfg(test)]
 mod tests;

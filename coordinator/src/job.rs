@@ -64,12 +64,12 @@ impl Job {
     }
 
     /// Shows how far it is. Threads may bring the states out of order: one that is older than
-    /// what is shown already is not shown.
-    pub(crate) fn publish(&self, progress: Progress) {
+    /// what is shown already is not shown. Says whether it is.
+    pub(crate) fn publish(&self, progress: Progress) -> bool {
         if progress.outcome.is_some() {
             self.keep_end(&progress);
         }
-        self.progress.send_if_modified(|shown| replace_older(shown, progress));
+        self.progress.send_if_modified(|shown| replace_older(shown, progress))
     }
 }
 

@@ -209,6 +209,18 @@ impl Leases {
         self.by_job.range(of_job).map(|(_, id)| self.held[id].worker).collect()
     }
 
+    /// The tiles of a job that workers have and have not brought, and whether they are known to have
+    /// begun them.
+    pub(crate) fn in_work(&self, job: JobId) -> impl Iterator<Item = (TileId, WorkerId, bool)> {
+        let of_job = (job, LeaseId(0))..=(job, LeaseId(u64::MAX));
+        let leases = self.by_job.range(of_job).map(|(_, id)| &self.held[id]);
+        leases.flat_map(|lease| {
+            let tiles = &self.jobs[&lease.job].tiles;
+            let places = lease.alone.iter().chain(&lease.shared).chain(&lease.again);
+            places.map(|place| (tiles.tile(*place), lease.worker, lease.begun.contains_key(place)))
+        })
+    }
+
     /// How many tiles a worker has.
     pub(crate) fn tile_count(&self, worker: WorkerId) -> usize {
         self.of(worker).map(|id| self.held[&id].count()).sum()

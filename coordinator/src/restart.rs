@@ -77,10 +77,12 @@ impl Coordinator {
             keeping: Keeping::default(),
             term: Duration::from_secs(4),
             upload_silence: Duration::from_secs(4),
+            events: None,
+            host: None,
             scene_folder: PathBuf::new(),
             picture_folder: PathBuf::new(),
         };
-        let shell = Shell::new(config, identity, [7; 32], Some(folder));
+        let shell = Shell::new(config, identity, [7; 32], Some(folder)).unwrap();
         let worker = shell.join(Process { nonce: 1, threads: 1, ..Process::default() }).unwrap();
         Ok(Self { shell, worker })
     }

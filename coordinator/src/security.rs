@@ -72,9 +72,10 @@ impl Role {
         let Some((service, method)) = path.trim_start_matches('/').split_once('/') else {
             return false;
         };
-        let reads = matches!(method, "List" | "Workers" | "Watch" | "Image");
+        let reads = matches!(method, "List" | "Workers" | "Watch" | "Image" | "Explain");
         match (self, service) {
             (Self::Admin, _) | (Self::Work, "rtfarm.v1.Farm") => true,
+            (Self::Read | Self::Submit, "page") => true,
             (Self::Read, "rtfarm.v1.Jobs") => reads,
             (Self::Submit, "rtfarm.v1.Jobs") => {
                 reads || matches!(method, "Submit" | "Cancel" | "Control")

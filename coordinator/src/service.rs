@@ -30,6 +30,7 @@ use tokio_stream::{Stream, wrappers::ReceiverStream};
 use tokio_util::sync::CancellationToken;
 use tonic::{
     Request, Response, Status, Streaming,
+    service::Routes,
     transport::{Server, ServerTlsConfig, server::Router},
 };
 
@@ -41,6 +42,7 @@ use crate::{
     job::Job,
     lease::Run,
     members::{MemberEntry, NoMember, Process, Standing},
+    page::{Keeper, Page},
     record::{Ticket, to_event, to_standing},
     security::Security,
     shell::{ChangeError, Config, Shell},
@@ -56,7 +58,7 @@ const WATCH_PERIOD: Duration = Duration::from_millis(50);
 type Chunks = Pin<Box<dyn Stream<Item = Result<wire::Chunk, Status>> + Send>>;
 type Events = Pin<Box<dyn Stream<Item = Result<wire::Event, Status>> + Send>>;
 
-/// Both services over one coordinator, for those who have a token if there is `security`.
+/// Both services over one coordinator and its page, for those who have a token if there is `security`.
 pub(crate) fn router(
     shell: &Arc<Shell>,
     security: Option<Arc<Security>>,
@@ -66,6 +68,11 @@ pub(crate) fn router(
     // A frame of a delivery; each costs both sides a call of the system.
     const FRAME_BYTES: u32 = 1 << 17;
     let (farm, jobs) = services(shell);
+    let keeper = security.clone().map_or(Keeper::Nobody, Keeper::Farm);
+    let routes = Routes::new(Guarded::new(farm, security.clone()))
+        .add_service(Guarded::new(jobs, security))
+        .into_axum_router()
+        .fallback_service(Page::new(shell, keeper));
     let server = match tls {
         Some(tls) => Server::builder().tls_config(tls)?,
         None => Server::builder(),
@@ -76,8 +83,16 @@ pub(crate) fn router(
         .max_frame_size(FRAME_BYTES)
         .http2_keepalive_interval(Some(Duration::from_secs(10)))
         .http2_keepalive_timeout(Some(Duration::from_secs(20)))
-        .add_service(Guarded::new(farm, security.clone()))
-        .add_service(Guarded::new(jobs, security)))
+        // Browsers speak it where nothing is encrypted.
+        .accept_http1(true)
+        .add_routes(routes.into()))
+}
+
+/// The page alone, for those who have this token.
+pub(crate) fn page_router(shell: &Arc<Shell>, token: &str) -> Router {
+    let page = Page::new(shell, Keeper::Token(blake3::hash(token.as_bytes())));
+    let routes = Routes::default().into_axum_router().fallback_service(page);
+    Server::builder().accept_http1(true).add_routes(routes.into())
 }
 
 /// What workers call, and what clients call.

@@ -14,7 +14,7 @@ use rtfarm_core::{
     prepared::SceneHash,
     tile::{TileGrid, TileId},
 };
-use rtfarm_job::{FinishedTile, Order, Progress};
+use rtfarm_job::{FinishedTile, Order, Outcome, Progress};
 use rtfarm_picture::{Canvas, CanvasTile, TileRecord};
 use rtfarm_proto::{Bytes, Incarnation, JobId, LeaseName, Renewal, WorkerId};
 use tokio::sync::{Notify, oneshot};
@@ -22,9 +22,10 @@ use tokio_util::sync::CancellationToken;
 
 use crate::{
     audit::Audit,
+    events::Events,
     farm::{
-        Action, Change, Delivery, DeliveryId, Earlier, Farm, JobEntry, Keeping, Next, Notice,
-        Refused, Terms, Verdict,
+        Action, Arrived, Change, Delivery, DeliveryId, Earlier, Farm, JobEntry, Keeping, Next,
+        Notice, Refused, Terms, Verdict,
     },
     identity::{Identity, Stranger},
     job::Job,
@@ -54,8 +55,12 @@ pub struct Config {
     pub audit: f64,
     /// How long jobs that have ended are kept.
     pub keeping: Keeping,
+    /// The name by which others know this machine: the page is shown under no other.
+    pub host: Option<String>,
     /// A client that sends nothing of its scene for this long is given up.
     pub upload_silence: Duration,
+    /// Where what happens is told besides, if anywhere: a JSON object a line.
+    pub events: Option<PathBuf>,
     /// For prepared scenes: a folder that is nobody else's.
     pub scene_folder: PathBuf,
     /// For pictures while they are rendered.
@@ -102,6 +107,8 @@ pub(crate) struct Shell {
     changing: Mutex<()>,
     /// Told when the machine wants to be woken earlier than it will be.
     earlier: Notify,
+    /// What happened.
+    pub(crate) events: Events,
     /// Cancelled when everybody has gone home: connections are to be closed.
     pub(crate) stop: CancellationToken,
 }
@@ -181,7 +188,8 @@ impl Shell {
         identity: Identity,
         secret: [u8; 32],
         mut folder: Option<StateFolder>,
-    ) -> Self {
+    ) -> io::Result<Self> {
+        let events = Events::new(config.events.as_deref())?;
         let audit = Audit::new(config.audit, secret);
         let mut farm = match &folder {
             Some(folder) => Farm::keeping_jobs(identity, config.term, audit, folder.last_job()),
@@ -207,12 +215,13 @@ impl Shell {
             state: Mutex::new(state),
             changing: Mutex::default(),
             earlier: Notify::new(),
+            events,
             stop: CancellationToken::new(),
         };
         for job in kept.into_iter().flatten() {
             shell.take_up(job);
         }
-        shell
+        Ok(shell)
     }
 
     fn state(&self) -> MutexGuard<'_, State> {
@@ -241,7 +250,15 @@ impl Shell {
             self.do_work(work);
         }
         for (job, progress) in works.progress.into_values() {
-            job.publish(progress);
+            let finished = match &progress.outcome {
+                Some(Outcome::Finished(time)) => Some(*time),
+                _ => None,
+            };
+            if job.publish(progress)
+                && let Some(time) = finished
+            {
+                self.events.on_finished(job.id, time);
+            }
         }
         value
     }
@@ -309,7 +326,10 @@ impl Shell {
 
     fn do_work(&self, work: Work) {
         match work {
-            Work::Log(notice) => log(*notice),
+            Work::Log(notice) => {
+                self.events.on_notice(&notice);
+                log(*notice);
+            }
             Work::Drop(job) => job.forget(),
             Work::Reopen(job) => job.reopen(),
             Work::Keep(job, terms) => job.keep(terms),
@@ -596,6 +616,7 @@ impl Shell {
             done = (tiles.done_count() > 0).then_some(tiles.done_count()),
             "job started"
         );
+        self.events.on_job(job.id, &job.ticket.name);
         self.tell(|state, now| {
             state.jobs.insert(job.id, Arc::clone(job));
             let terms = terms_of(job, is_paused, false);
@@ -610,6 +631,8 @@ impl Shell {
         let job = Job::new(id, ticket, &plan, scene, canvas, Some(folder));
         if let Some((end, age)) = end {
             let terms = terms_of(&job, is_paused, is_foreign);
+            // Who watches is not told of its end as of news.
+            job.progress.send_replace(end.clone());
             self.tell(|state, now| {
                 state.jobs.insert(id, job);
                 ((), state.farm.on_kept(id, end, terms, (age, now)))
@@ -654,6 +677,21 @@ impl Shell {
     /// The workers, and how many tiles each has.
     pub(crate) fn workers(&self) -> Vec<(MemberEntry, usize)> {
         self.tell(|state, now| (state.farm.worker_entries(now), Vec::new()))
+    }
+
+    /// Which tiles came into a job's picture, but for the first `seen`.
+    pub(crate) fn arrived(&self, job: JobId, seen: usize) -> Option<Arrived> {
+        self.state().farm.arrived(job, seen)
+    }
+
+    /// Says of each tile of a job whether it is in the picture, if that is known.
+    pub(crate) fn done(&self, job: JobId) -> Option<Vec<bool>> {
+        self.state().farm.done(job)
+    }
+
+    /// The tiles of a job that workers have, and whether they are known to have begun them.
+    pub(crate) fn in_work(&self, job: JobId) -> Vec<(TileId, WorkerId, bool)> {
+        self.state().farm.in_work(job)
     }
 
     /// Decides what a worker gets.

@@ -362,11 +362,13 @@ impl World {
             term: TERM,
             audit: f64::from(u8::from(self.hosts[0].is_liar)),
             upload_silence: Duration::from_secs(5),
+            events: None,
+            host: None,
             scene_folder: self.folder.path().to_owned(),
             picture_folder: self.folder.path().to_owned(),
             keeping: Keeping::default(),
         };
-        let shell = Arc::new(Shell::new(config, identity, [count as u8; 32], folder));
+        let shell = Arc::new(Shell::new(config, identity, [count as u8; 32], folder).unwrap());
         let (farm, jobs) = services(&shell);
         let over = CancellationToken::new();
         let start = Arc::new(Start { shell, farm, jobs, disk, over });

@@ -45,7 +45,7 @@ impl PictureFormat {
 }
 
 /// Clamps to `0..=1`, encodes and rounds to the nearest step, halves upwards.
-fn quantize(channel: f32, transfer: Transfer, steps: f64) -> f64 {
+pub(crate) fn quantize(channel: f32, transfer: Transfer, steps: f64) -> f64 {
     (transfer.encode(f64::from(channel).clamp(0.0, 1.0)) * steps + 0.5).floor()
 }
 

@@ -4,6 +4,7 @@
 mod faults;
 mod frames;
 mod liar;
+mod page;
 mod queue;
 mod security;
 mod slurm;
@@ -12,7 +13,7 @@ use std::{
     collections::BTreeSet,
     fs::{self, File},
     io::{BufRead, BufReader},
-    net::TcpListener,
+    net::{TcpListener, TcpStream},
     path::{Path, PathBuf},
     process::{Child, ChildStdout, Command, ExitStatus, Stdio},
     thread,

@@ -215,7 +215,7 @@ impl Farm {
                 job.progress.worker_count = earlier.worker_count;
                 job.progress.tiles_done = tiles.done_count();
                 job.earlier = earlier;
-                job.tallies.clear();
+                job.brought.clear();
                 tiles
             }
             (None, None) => return refused(Refused::TilesUnknown),
