@@ -23,7 +23,11 @@ use rtfarm_ladder::Effort;
 use rtfarm_picture::PictureFormat;
 use rtfarm_proto::{Access, Address};
 
-use crate::{frames::FrameRange, output::Output};
+use crate::{
+    frames::FrameRange,
+    output::Output,
+    slurm::{Host, SbatchOptions},
+};
 
 /// Renders scenes in the rt language, on one machine or many.
 #[derive(Debug, Parser)]
@@ -363,6 +367,17 @@ pub(crate) struct RenderArgs {
     #[arg(long, help_heading = WORK)]
     pub(crate) no_cache: bool,
 
+    /// Have workers of a cluster render: Slurm gets an array of them with these options of sbatch.
+    ///
+    /// Such as "--array=1-8 --cpus-per-task=16 --time=30". The nodes must share the disk of FILE and of
+    /// this program; a folder beside FILE has their access file and their logs until the picture is there.
+    #[arg(long, value_name = "OPTIONS", allow_hyphen_values = true, conflicts_with_all = ["workers", "threads", "isa", "time"], help_heading = WORK)]
+    pub(crate) slurm: Option<SbatchOptions>,
+
+    /// Where the nodes of --slurm find this machine; by default by its name, at a free port.
+    #[arg(long, value_name = "HOST[:PORT]", env = "RTFARM_SLURM_HOST", help_heading = WORK)]
+    slurm_host: Option<Host>,
+
     /// Worker processes; 0 renders in this one. Default: 2, or 1 on a single core.
     #[arg(long, value_name = "N", value_parser = value_parser!(u16).range(0..=256), help_heading = WORK)]
     workers: Option<u16>,
@@ -379,7 +394,8 @@ pub(crate) struct RenderArgs {
     #[arg(long, value_name = "S", default_value = "4", value_parser = parse_seconds, help_heading = WORK)]
     pub(crate) lease_seconds: Duration,
 
-    /// How long to go on though no worker process does anything.
+    /// How long to go on though no worker process does anything; with --slurm, how long workers go on
+    /// when this process is gone.
     #[arg(long, value_name = "S", default_value = "60", value_parser = parse_seconds, help_heading = WORK)]
     pub(crate) patience: Duration,
 
@@ -757,6 +773,11 @@ impl PictureArgs {
 }
 
 impl RenderArgs {
+    /// Where workers that Slurm starts find this machine.
+    pub(crate) fn slurm_host(&self) -> Host {
+        self.slurm_host.clone().unwrap_or(Host::HERE)
+    }
+
     /// Worker processes, and threads of each.
     pub(crate) fn workers_and_threads(&self) -> (usize, usize) {
         let cores = core_count();

@@ -1,4 +1,4 @@
-//! `rtfarm render`: a picture from this machine alone.
+//! `rtfarm render`: a picture by this machine alone, or by a cluster's nodes.
 
 use std::{
     collections::VecDeque,
@@ -10,6 +10,7 @@ use std::{
 use anyhow::{Context, anyhow};
 use rtfarm_coordinator::{Config, Coordinator, Job, Keeping, Listener};
 use rtfarm_core::{
+    isa::Isa,
     language::{Style, draw_diagnostics},
     render::{DEEPEST, Sampling, Tally},
     tile::Size,
@@ -40,7 +41,7 @@ use crate::{
     private_folder::PrivateFolder,
     resume::{Begun, Resume},
     scene_files::SceneFiles,
-    show,
+    show, slurm,
     source::SceneText,
 };
 
@@ -212,7 +213,7 @@ pub(crate) async fn run(
     let mut render = Render { args: &args, console, stop, coordinator: None, told: started.into() };
     let first = render.place_next(&mut wanted).await?.expect("there is one at least");
     match args.workers_and_threads() {
-        (0, _) => {
+        (0, _) if args.slurm.is_none() => {
             let (last, end) = render.all_but_the_last(first, wanted).await?;
             render.write(last).await?;
             end
@@ -291,6 +292,7 @@ impl Render<'_> {
     /// Waits until a picture is rendered.
     async fn render(&self, started: Started) -> Result<Rendered, Failure> {
         let Started { size, sampling, transfer, output, resume, work } = started;
+        let mut workers = self.args.workers_and_threads().0;
         let (picture, tally, rendering) = match work {
             Work::Here(ordered) => {
                 let (order, begun) = *ordered;
@@ -307,11 +309,13 @@ impl Render<'_> {
             }
             Work::Job(job) => {
                 let rendering = wait(&job, self.console).await?;
-                let tally = job.progress().borrow().tally;
+                let Progress { tally, worker_count, .. } = *job.progress().borrow();
+                if self.args.slurm.is_some() {
+                    workers = worker_count as usize;
+                }
                 (Drawn::Job(job), tally, rendering)
             }
         };
-        let workers = self.args.workers_and_threads().0;
         let summary = Summary { size, tally, sampling, transfer, rendering, workers };
         Ok(Rendered { summary, output, resume, picture })
     }
@@ -381,24 +385,36 @@ impl Render<'_> {
         Ok((canvas, tally, rendering))
     }
 
-    /// Renders all pictures by local workers.
+    /// Renders all pictures by workers.
     async fn with_workers(
         &mut self,
         (workers, threads): (usize, usize),
         first: Frame,
         wanted: Wanted,
     ) -> Result<(), Failure> {
+        let args = self.args;
         let folder = PrivateFolder::new(&std::env::temp_dir())?;
         let socket = folder.path().join("socket");
-        let listener = UnixListener::bind(&socket)
-            .with_context(|| format!("cannot listen on {}", socket.display()))?;
+        let (listener, slurm) = if let Some(options) = args.slurm.clone() {
+            let (host, patience) = (args.slurm_host(), args.patience);
+            let shared = first.output.folder();
+            let ordering =
+                spawn_blocking(move || slurm::Order::new(&shared, options, host, patience));
+            let (order, listener) = ordering.await??;
+            (listener, Some(order))
+        } else {
+            let listener = UnixListener::bind(&socket)
+                .with_context(|| format!("cannot listen on {}", socket.display()))?;
+            (Listener::Unix(listener), None)
+        };
+        let is_here = slurm.is_none();
         let coordinator = Coordinator::new(Config {
             version: VERSION.to_owned(),
             build: BUILD.to_owned(),
-            // The workers are this very program on this machine: nobody here has a reason to lie.
-            reference: None,
-            term: self.args.lease_seconds,
-            audit: 0.0,
+            // Local workers are this very program on this machine: nobody here has a reason to lie.
+            reference: (!is_here).then(|| rtfarm_worker::reference(Isa::fastest())),
+            term: args.lease_seconds,
+            audit: if is_here { 0.0 } else { AUDIT },
             keeping: Keeping::default(),
             upload_silence: UPLOAD_SILENCE,
             events: None,
@@ -414,20 +430,24 @@ impl Render<'_> {
         let stop_serving = CancellationToken::new();
         let serving = tokio::spawn({
             let (coordinator, stop) = (coordinator.clone(), stop_serving.clone());
-            async move { coordinator.run(Listener::Unix(listener), stop.cancelled()).await }
+            async move { coordinator.run(listener, stop.cancelled()).await }
         });
-        let setup = Setup {
-            coordinator: Address::Unix(socket),
-            threads,
-            isa: self.args.isa.0,
-            log_format: self.args.log_format,
+        let mut crew = if let Some(order) = slurm {
+            Crew::Slurm(order.submit().await?)
+        } else {
+            let setup = Setup {
+                coordinator: Address::Unix(socket),
+                threads,
+                isa: args.isa.0,
+                log_format: args.log_format,
+            };
+            let children = Children::start(workers, setup, self.console);
+            Crew::Local(children.context("cannot start workers")?)
         };
-        let mut children =
-            Children::start(workers, setup, self.console).context("cannot start workers")?;
 
         let rendered = tokio::select! {
             rendered = self.all_but_the_last(first, wanted) => rendered,
-            reason = children.keep_up(&coordinator, self.args.patience) => {
+            reason = crew.keep_up(&coordinator, args.patience) => {
                 Err(Failure::Other(anyhow!(reason)))
             }
             () = self.stop.cancelled() => Err(Failure::Interrupted),
@@ -435,18 +455,53 @@ impl Render<'_> {
         coordinator.close();
         let end = match rendered {
             Ok((last, end)) => {
-                let (written, ()) = tokio::join!(self.write(last), children.go_home(&coordinator));
+                let (written, ()) = tokio::join!(self.write(last), crew.go_home(&coordinator));
                 written.and(end)
             }
             Err(failure) => {
                 coordinator.cancel_all();
-                children.end(&coordinator).await;
+                crew.end(&coordinator).await;
                 Err(failure)
             }
         };
         stop_serving.cancel();
         serving.await??;
         end
+    }
+}
+
+/// How much of what workers on other machines render is rendered again; see `coordinator --audit`.
+const AUDIT: f64 = 0.01;
+
+/// Those who render.
+enum Crew {
+    Local(Children),
+    Slurm(slurm::Array),
+}
+
+impl Crew {
+    /// Returns when nobody is left to render, with what to say of it.
+    async fn keep_up(&mut self, coordinator: &Coordinator, patience: Duration) -> String {
+        match self {
+            Self::Local(children) => children.keep_up(coordinator, patience).await,
+            Self::Slurm(array) => array.keep_up().await,
+        }
+    }
+
+    /// Waits for them to go home, then ends those that do not.
+    async fn go_home(&mut self, coordinator: &Coordinator) {
+        match self {
+            Self::Local(children) => children.go_home(coordinator).await,
+            Self::Slurm(array) => array.end().await,
+        }
+    }
+
+    /// Ends them now.
+    async fn end(&mut self, coordinator: &Coordinator) {
+        match self {
+            Self::Local(children) => children.end(coordinator).await,
+            Self::Slurm(array) => array.end().await,
+        }
     }
 }
 

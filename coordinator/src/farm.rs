@@ -588,11 +588,10 @@ impl Farm {
     /// A lease of another worker whose next tile of `job` should have come long ago.
     fn overdue(&self, job: JobId, worker: WorkerId, now: Instant) -> Option<LeaseId> {
         let predicted = self.leases.pace(job)?.mean()?;
-        let mut quiet = self.leases.quietest().take_while(|quiet| quiet.from <= now);
-        let overdue = quiet.find(|quiet| {
-            let from = quiet.last_tile + LONGEST_QUIET + predicted * OVERDUE;
-            quiet.lease.job == job && quiet.worker != worker && from <= now
-        });
+        let mut quiet = self.leases.quietest(job);
+        let overdue = quiet
+            .find(|quiet| quiet.worker != worker)
+            .filter(|quiet| quiet.last_tile + LONGEST_QUIET + predicted * OVERDUE <= now);
         overdue.map(|quiet| quiet.lease.id)
     }
 
@@ -608,16 +607,20 @@ impl Farm {
     /// From when on which waiting question can be answered with a tile of which quiet lease.
     fn next_second_rendering(&self) -> Option<(Instant, AskId, LeaseId)> {
         self.waiting.first()?;
-        // With two that wait, the first lease will do; with one, all but its own.
-        self.leases.quietest().find_map(|quiet| {
-            let may = |worker| {
-                worker != quiet.worker
-                    && !self.leases.is_on_trial(worker)
-                    && self.may_begin(worker, quiet.lease.job)
-            };
-            let (ask, _) = self.waiting.iter().find(|(_, ask)| may(ask.worker))?;
-            Some((quiet.from, ask, quiet.lease.id))
-        })
+        // With two that wait, the first lease of a job will do; with one, all but its own.
+        let first_of = |job| {
+            self.leases.quietest(job).find_map(|quiet| {
+                let may = |worker| {
+                    worker != quiet.worker
+                        && !self.leases.is_on_trial(worker)
+                        && self.may_begin(worker, job)
+                };
+                let (ask, _) = self.waiting.iter().find(|(_, ask)| may(ask.worker))?;
+                Some((quiet.from, ask, quiet.lease.id))
+            })
+        };
+        let firsts = self.leases.quiet_jobs().filter_map(first_of);
+        firsts.min_by_key(|&(from, _, lease)| (from, lease))
     }
 
     // Rendering and stitching.

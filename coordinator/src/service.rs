@@ -24,6 +24,7 @@ use rtfarm_proto::{
         submit_response,
     },
 };
+use rustix::io::Errno;
 use tokio::sync::{mpsc, oneshot};
 use tokio_stream::{Stream, wrappers::ReceiverStream};
 use tokio_util::sync::CancellationToken;
@@ -803,8 +804,14 @@ fn stranger(error: Stranger) -> Status {
     Status::not_found(error.to_string())
 }
 
+/// What is short for a while can be asked for again; what is broken cannot.
 fn broken(error: &io::Error) -> Status {
-    Status::internal(error.to_string())
+    let short = [Errno::MFILE, Errno::NFILE, Errno::NOMEM].map(Errno::raw_os_error);
+    if error.raw_os_error().is_some_and(|number| short.contains(&number)) {
+        Status::unavailable(error.to_string())
+    } else {
+        Status::internal(error.to_string())
+    }
 }
 
 async fn blocking<T: Send + 'static>(
@@ -817,5 +824,23 @@ async fn blocking<T: Send + 'static>(
     match tokio::task::spawn_blocking(work).await {
         Ok(result) => result,
         Err(error) => Err(Status::internal(error.to_string())),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use tonic::Code;
+
+    /// A worker that is refused for good ends; one that may ask again does.
+    #[test]
+    fn what_is_short_for_a_while_can_be_asked_for_again() {
+        let code = |errno: Errno| broken(&errno.into()).code();
+        for errno in [Errno::MFILE, Errno::NFILE, Errno::NOMEM] {
+            assert_eq!(code(errno), Code::Unavailable, "{errno}");
+        }
+        for errno in [Errno::IO, Errno::NOSPC, Errno::ROFS] {
+            assert_eq!(code(errno), Code::Internal, "{errno}");
+        }
     }
 }

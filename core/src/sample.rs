@@ -83,6 +83,32 @@ impl Sample {
     }
 }
 
+/// Samples whose places are found at once.
+pub(crate) const AT_ONCE: usize = 8;
+
+/// Finds the places of samples: `[across or down][sample]`, each as [`Sample::position`] does.
+#[inline(always)]
+pub(crate) fn positions(samples: &[Sample; AT_ONCE]) -> [[f64; AT_ONCE]; 2] {
+    let mut places = [[0.5; AT_ONCE]; 2];
+    if samples.iter().any(|sample| sample.is_alone) {
+        for (place, sample) in samples.iter().enumerate() {
+            [places[0][place], places[1][place]] = sample.position();
+        }
+        return places;
+    }
+    let (mut indices, mut seeds) = ([0; AT_ONCE], [0; AT_ONCE]);
+    for (place, sample) in samples.iter().enumerate() {
+        indices[place] = sample.index;
+        seeds[place] = (sample.key >> 32) as u32;
+    }
+    for place in 0..AT_ONCE {
+        let [across, down] = sobol_pair(indices[place], seeds[place]);
+        places[0][place] = f64::from(across);
+        places[1][place] = f64::from(down);
+    }
+    places
+}
+
 /// Random numbers for one ray that gathers, all in `0..1`.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct GatherNumbers(Sample);
@@ -116,6 +142,7 @@ impl GatherNumbers {
 /// once for both, and no table of directions is gone through: the first dimension is the index with
 /// its bits reversed, the second its product with Pascal's triangle modulo 2, whose columns double
 /// in four steps.
+#[inline(always)]
 fn sobol_pair(index: u32, seed: u32) -> [f32; 2] {
     let shuffled =
         owen_scramble_rev(index.reverse_bits(), hash(seed ^ 0x79c6_8e4a)).reverse_bits() & 0xffff;
@@ -169,6 +196,19 @@ mod tests {
             for seed in [0, 1, 0xffff_ffff, 0x1234_5678, index.wrapping_mul(0x9e37_79b9)] {
                 let both = [0, 1].map(|dimension| sobol_burley::sample(index, dimension, seed));
                 assert_eq!(sobol_pair(index, seed), both, "{index}, {seed:#x}");
+            }
+        }
+    }
+
+    #[test]
+    fn places_at_once_are_those_of_each() {
+        for count in [1, 4, 16, 1000] {
+            let samples: [Sample; AT_ONCE] = std::array::from_fn(|k| {
+                Samples::new(count, 3, 5 + k as u32 / 3, 7).sample(k as u32 % count)
+            });
+            let [across, down] = positions(&samples);
+            for (k, sample) in samples.iter().enumerate() {
+                assert_eq!([across[k], down[k]], sample.position(), "{count}, {k}");
             }
         }
     }

@@ -7,6 +7,7 @@ mod liar;
 mod page;
 mod queue;
 mod security;
+mod slurm;
 mod verify;
 
 use std::{

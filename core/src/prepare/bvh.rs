@@ -6,6 +6,7 @@
 //! of Packets" (2008). The same input gives the same bytes on any number of threads: bins hold
 //! minima, maxima and counts, which do not care for order, and every split is made by one thread.
 
+use glam::Vec4;
 use rayon::prelude::*;
 
 use crate::prepared::node::{Child, Node};
@@ -18,49 +19,60 @@ const SERIAL: usize = 4096;
 
 const BINS: usize = 16;
 
+/// Ranges of up to this many items have half as many bins.
+const FEW: usize = 32;
+
 /// Ranges of up to this many faces are leaves. Splitting them further makes a triangle mesh no
 /// faster to trace and takes half as many bytes again.
 const LEAF: usize = 4;
 
-/// An axis-aligned box.
+/// An axis-aligned box. The fourth numbers mean nothing: with them a corner is one load.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Bounds {
-    pub(super) min: [f32; 3],
-    pub(super) max: [f32; 3],
+    min: Vec4,
+    max: Vec4,
 }
 
 impl Bounds {
-    const NONE: Self = Self { min: [f32::INFINITY; 3], max: [f32::NEG_INFINITY; 3] };
+    const NONE: Self = Self { min: Vec4::INFINITY, max: Vec4::NEG_INFINITY };
 
     #[inline(always)]
     fn join(self, other: &Self) -> Self {
-        let mut joined = self;
-        for axis in 0..3 {
-            joined.min[axis] = joined.min[axis].min(other.min[axis]);
-            joined.max[axis] = joined.max[axis].max(other.max[axis]);
-        }
-        joined
+        Self { min: self.min.min(other.min), max: self.max.max(other.max) }
     }
 
     /// Half the surface.
     #[inline(always)]
     fn half_area(&self) -> f32 {
-        let [x, y, z] = [0, 1, 2].map(|axis| self.max[axis] - self.min[axis]);
+        let [x, y, z, _] = (self.max - self.min).to_array();
         if x < 0.0 { 0.0 } else { x * y + y * z + z * x }
     }
 
-    /// Twice the coordinate of the centre.
+    /// Twice the centre.
     #[inline(always)]
-    fn twice_center(&self, axis: usize) -> f32 {
-        self.min[axis] + self.max[axis]
+    fn twice_center(&self) -> Vec4 {
+        self.min + self.max
     }
 }
 
-/// An item that the hierarchy is built over: its box and its number.
+/// An item that the hierarchy is built over: its box and, in the bits of the fourth number of its
+/// least corner, its own number.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct BuildPrimitive {
-    pub(super) bounds: Bounds,
-    pub(super) item: u32,
+pub(super) struct BuildPrimitive(Bounds);
+
+impl BuildPrimitive {
+    /// An item of a number and its box.
+    pub(super) fn new([x, y, z]: [f32; 3], max: [f32; 3], item: u32) -> Self {
+        // Of two zeros the smaller one would be a matter of order.
+        let [least_x, least_y, least_z] = [x + 0.0, y + 0.0, z + 0.0];
+        let [x, y, z] = max.map(|x| x + 0.0);
+        let min = Vec4::new(least_x, least_y, least_z, f32::from_bits(item));
+        Self(Bounds { min, max: Vec4::new(x, y, z, 0.0) })
+    }
+
+    pub(super) fn item(&self) -> u32 {
+        self.0.min.w.to_bits()
+    }
 }
 
 /// A run of primitives that will be a node or a leaf.
@@ -89,9 +101,9 @@ impl<'a> BuildRange<'a> {
     fn new(primitives: &'a mut [BuildPrimitive], first: usize, alone_from: u32) -> Self {
         let measure = |chunk: &[BuildPrimitive]| {
             chunk.iter().fold((Bounds::NONE, Bounds::NONE), |(bounds, centers), primitive| {
-                let middle = [0, 1, 2].map(|axis| primitive.bounds.twice_center(axis));
+                let middle = primitive.0.twice_center();
                 let point = Bounds { min: middle, max: middle };
-                (bounds.join(&primitive.bounds), centers.join(&point))
+                (bounds.join(&primitive.0), centers.join(&point))
             })
         };
         let (bounds, centers) = if primitives.len() > 8 * SERIAL {
@@ -118,7 +130,7 @@ impl<'a> BuildRange<'a> {
     }
 
     fn is_leaf(&self) -> bool {
-        let is_alone = |primitive: &BuildPrimitive| primitive.item >= self.alone_from;
+        let is_alone = |primitive: &BuildPrimitive| primitive.item() >= self.alone_from;
         self.primitives.len() == 1
             || self.primitives.len() <= LEAF && !self.primitives.iter().any(is_alone)
     }
@@ -126,12 +138,16 @@ impl<'a> BuildRange<'a> {
     /// The split between two bins with the least area x count on its sides; `None` where the
     /// centres do not differ enough for bins.
     fn cheapest_split(&self) -> Option<Split> {
-        let scale = [0, 1, 2].map(|axis| {
-            let extent = self.centers.max[axis] - self.centers.min[axis];
-            let scale = BINS as f32 * (1.0 - f32::EPSILON) / extent;
-            if extent > 0.0 && scale.is_finite() { scale } else { 0.0 }
-        });
-        let binning = Binning { low: self.centers.min, scale };
+        let count = if self.primitives.len() > FEW { BINS } else { BINS / 2 };
+        let extent = (self.centers.max - self.centers.min).to_array();
+        let mut scale = [0.0; 4];
+        for axis in 0..3 {
+            let fitting = count as f32 * (1.0 - f32::EPSILON) / extent[axis];
+            if extent[axis] > 0.0 && fitting.is_finite() {
+                scale[axis] = fitting;
+            }
+        }
+        let binning = Binning { low: self.centers.min, scale: Vec4::from_array(scale) };
         let bins = if self.primitives.len() > 8 * SERIAL {
             self.primitives
                 .par_chunks(SERIAL)
@@ -144,12 +160,12 @@ impl<'a> BuildRange<'a> {
         for axis in (0..3).filter(|&axis| scale[axis] > 0.0) {
             let mut right_cost = [0.0; BINS];
             let mut side = Bin::EMPTY;
-            for bin in (1..BINS).rev() {
+            for bin in (1..count).rev() {
                 side = side.join(&bins[axis][bin]);
                 right_cost[bin] = side.bounds.half_area() * side.count as f32;
             }
             side = Bin::EMPTY;
-            for bin in 1..BINS {
+            for bin in 1..count {
                 side = side.join(&bins[axis][bin - 1]);
                 let cost = side.bounds.half_area() * side.count as f32 + right_cost[bin];
                 let is_split = side.count > 0 && (side.count as usize) < self.primitives.len();
@@ -164,8 +180,8 @@ impl<'a> BuildRange<'a> {
 
 #[derive(Clone, Copy)]
 struct Binning {
-    low: [f32; 3],
-    scale: [f32; 3],
+    low: Vec4,
+    scale: Vec4,
 }
 
 #[derive(Clone, Copy)]
@@ -194,18 +210,22 @@ fn merge_bins(a: &[[Bin; BINS]; 3], b: &[[Bin; BINS]; 3]) -> [[Bin; BINS]; 3] {
 }
 
 impl Binning {
+    /// The bin of a box on each axis.
     #[inline(always)]
-    fn bin(&self, bounds: &Bounds, axis: usize) -> usize {
-        let bin = (bounds.twice_center(axis) - self.low[axis]) * self.scale[axis];
-        (bin as usize).min(BINS - 1)
+    fn bins(&self, bounds: &Bounds) -> [usize; 3] {
+        // Up to the next power of two the bits of a number from here on count in ones.
+        const ONES: f32 = (3 << 22) as f32;
+        let at = (bounds.twice_center() - self.low) * self.scale;
+        let [x, y, z, _] = (at - 0.5 + ONES).to_array();
+        [x, y, z].map(|x| x.to_bits() as usize % BINS)
     }
 
     fn fill(&self, primitives: &[BuildPrimitive]) -> [[Bin; BINS]; 3] {
         let mut bins = [[Bin::EMPTY; BINS]; 3];
-        for primitive in primitives {
-            for (axis, bins) in bins.iter_mut().enumerate() {
-                let bin = &mut bins[self.bin(&primitive.bounds, axis)];
-                bin.bounds = bin.bounds.join(&primitive.bounds);
+        for BuildPrimitive(bounds) in primitives {
+            for (bins, bin) in bins.iter_mut().zip(self.bins(bounds)) {
+                let bin = &mut bins[bin];
+                bin.bounds = bin.bounds.join(bounds);
                 bin.count += 1;
             }
         }
@@ -217,7 +237,7 @@ impl Split {
     /// Brings those left of the split to the front; returns how many they are.
     fn partition(&self, primitives: &mut [BuildPrimitive]) -> usize {
         let is_left =
-            |primitive: &BuildPrimitive| self.binning.bin(&primitive.bounds, self.axis) < self.bin;
+            |primitive: &BuildPrimitive| self.binning.bins(&primitive.0)[self.axis] < self.bin;
         let (mut left, mut right) = (0, primitives.len());
         loop {
             while left < right && is_left(&primitives[left]) {
@@ -266,7 +286,9 @@ fn build_node(range: BuildRange<'_>, level: usize) -> Vec<Node> {
     } else {
         ranges.into_iter().map(build).collect()
     };
-    let mut nodes = vec![node];
+    let below = built.iter().flatten().map(Vec::len);
+    let mut nodes = Vec::with_capacity(1 + below.sum::<usize>());
+    nodes.push(node);
     for (k, child) in built.into_iter().enumerate() {
         match child {
             Err(leaf) => nodes[0].children[k] = leaf,
@@ -294,10 +316,7 @@ mod tests {
         let mut primitives: Vec<BuildPrimitive> = boxes
             .iter()
             .enumerate()
-            .map(|(item, &(min, max))| BuildPrimitive {
-                bounds: Bounds { min, max },
-                item: item as u32,
-            })
+            .map(|(item, &(min, max))| BuildPrimitive::new(min, max, item as u32))
             .collect();
         let nodes = build_bvh(&mut primitives, u32::MAX);
         let mut seen = vec![0; boxes.len()];
@@ -314,10 +333,10 @@ mod tests {
                     continue;
                 }
                 for primitive in &primitives[child.items()] {
-                    seen[primitive.item as usize] += 1;
+                    seen[primitive.item() as usize] += 1;
                     for axis in 0..3 {
-                        assert!(node.planes[axis][k] <= primitive.bounds.min[axis]);
-                        assert!(node.planes[axis + 3][k] >= primitive.bounds.max[axis]);
+                        assert!(node.planes[axis][k] <= primitive.0.min[axis]);
+                        assert!(node.planes[axis + 3][k] >= primitive.0.max[axis]);
                     }
                 }
             }
@@ -375,18 +394,16 @@ mod tests {
         let mut best: Option<(usize, usize, f32)> = None;
         for axis in 0..3 {
             let mut sorted = range.primitives.to_vec();
-            sorted.sort_by(|a, b| {
-                a.bounds.twice_center(axis).total_cmp(&b.bounds.twice_center(axis))
-            });
+            sorted.sort_by(|a, b| a.0.twice_center()[axis].total_cmp(&b.0.twice_center()[axis]));
             let mut right_cost = vec![0.0; sorted.len()];
             let mut side = Bounds::NONE;
             for k in (1..sorted.len()).rev() {
-                side = side.join(&sorted[k].bounds);
+                side = side.join(&sorted[k].0);
                 right_cost[k] = side.half_area() * (sorted.len() - k) as f32;
             }
             side = Bounds::NONE;
             for k in 1..sorted.len() {
-                side = side.join(&sorted[k - 1].bounds);
+                side = side.join(&sorted[k - 1].0);
                 let cost = side.half_area() * k as f32 + right_cost[k];
                 if best.is_none_or(|best| cost < best.2) {
                     best = Some((axis, k, cost));
@@ -406,7 +423,7 @@ mod tests {
         let halves = match splitter.and_then(|splitter| splitter(&range)) {
             None => range.split(0),
             Some((axis, at, _)) => {
-                let middle = |primitive: &BuildPrimitive| primitive.bounds.twice_center(axis);
+                let middle = |primitive: &BuildPrimitive| primitive.0.twice_center()[axis];
                 range.primitives.sort_by(|a, b| middle(a).total_cmp(&middle(b)));
                 let (left, right) = range.primitives.split_at_mut(at);
                 [left, right].map(|half| BuildRange::new(half, 0, u32::MAX))
@@ -424,7 +441,7 @@ mod tests {
         boxes.extend(teapot);
         let primitives: Vec<BuildPrimitive> = (0..)
             .zip(boxes)
-            .map(|(item, (min, max))| BuildPrimitive { bounds: Bounds { min, max }, item })
+            .map(|(item, (min, max))| BuildPrimitive::new(min, max, item))
             .collect();
         let cost_of = |splitter| {
             let mut primitives = primitives.clone();

@@ -1,7 +1,5 @@
 //! The first step: all faces of a scene, in the scene's own units.
 
-use glam::DVec3;
-
 use super::{
     flat::{FaceAttributes, FlatFaces},
     place::place_mesh,
@@ -21,34 +19,38 @@ pub(super) struct Collected {
 impl Collected {
     /// Collects the faces of a scene: those of meshes where the scene places them.
     pub(crate) fn new(scene: &Scene, ranks: &Ranks) -> Self {
-        let mut corners: Vec<DVec3> =
-            scene.triangles.iter().flat_map(|face| face.vertices).collect();
         let of_primitive = |material: u32, primitive: u32| FaceAttributes {
             material,
             rank: ranks.first(primitive),
         };
-        let mut attributes: Vec<FaceAttributes> = scene
-            .triangles
-            .iter()
-            .map(|face| of_primitive(face.material, face.primitive))
-            .collect();
+        let of_meshes = scene.meshes.iter().map(|mesh| mesh.shape.triangles.len());
+        let triangle_count = scene.triangles.len() + of_meshes.sum::<usize>();
+        let mut flat = FlatFaces {
+            points: Vec::new(),
+            corners: Vec::with_capacity(3 * triangle_count + 4 * scene.quadrangles.len()),
+            attributes: Vec::with_capacity(triangle_count + scene.quadrangles.len()),
+            triangle_count,
+            quadrangle_count: scene.quadrangles.len() + 6 * scene.parallelepipeds.len(),
+            box_edges: Vec::new(),
+        };
+        for face in &scene.triangles {
+            flat.push_points(&face.vertices);
+            flat.attributes.push(of_primitive(face.material, face.primitive));
+        }
         for mesh in &scene.meshes {
-            let vertices = place_mesh(mesh);
+            let first_point = flat.points.len() as u32;
+            flat.points.extend(place_mesh(mesh));
             let first = ranks.first(mesh.primitive);
             for (face, triangle) in (0..).zip(&mesh.shape.triangles) {
-                corners.extend(triangle.map(|corner| vertices[corner as usize]));
-                attributes.push(FaceAttributes { material: mesh.material, rank: first + face });
+                flat.corners.extend(triangle.map(|corner| first_point + corner));
+                let rank = first + face;
+                flat.attributes.push(FaceAttributes { material: mesh.material, rank });
             }
         }
-        let triangle_count = attributes.len();
-        corners.extend(scene.quadrangles.iter().flat_map(|face| face.vertices));
-        attributes.extend(
-            scene.quadrangles.iter().map(|face| of_primitive(face.material, face.primitive)),
-        );
-        let quadrangle_count = scene.quadrangles.len() + 6 * scene.parallelepipeds.len();
-        let box_edges = Vec::new();
-        let mut flat =
-            FlatFaces { corners, attributes, triangle_count, quadrangle_count, box_edges };
+        for face in &scene.quadrangles {
+            flat.push_points(&face.vertices);
+            flat.attributes.push(of_primitive(face.material, face.primitive));
+        }
         for solid in &scene.parallelepipeds {
             flat.push_box(solid, ranks.first(solid.primitive));
         }

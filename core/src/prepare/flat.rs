@@ -1,6 +1,6 @@
 //! Flat faces with their corners.
 
-use std::ops::Range;
+use std::ops::{Deref, Range};
 
 use glam::DVec3;
 
@@ -13,8 +13,11 @@ use crate::scene::Parallelepiped;
 /// The flat faces of a scene, numbered in this order: triangles, quadrangles, then the faces of the
 /// parallelepipeds in solids, six each, which are no items of their own.
 pub(super) struct FlatFaces {
-    /// The corners in the order of the faces: three of each triangle, four of every other face.
-    pub(super) corners: Vec<DVec3>,
+    /// Where corners are; no face may be there.
+    pub(super) points: Vec<DVec3>,
+    /// The points of the corners in the order of the faces: three of each triangle, four of every
+    /// other face.
+    pub(super) corners: Vec<u32>,
     /// The materials and ranks of all flat faces.
     pub(super) attributes: Vec<FaceAttributes>,
     pub(super) triangle_count: usize,
@@ -23,6 +26,20 @@ pub(super) struct FlatFaces {
     /// The edges of each face of a parallelepiped, which are the last of the flat faces: the sum of
     /// a corner and an edge rounds, and would turn the plane of a needle.
     pub(super) box_edges: Vec<[DVec3; 2]>,
+}
+
+/// The corners of a face, three or four.
+pub(super) struct Corners {
+    points: [DVec3; 4],
+    count: usize,
+}
+
+impl Deref for Corners {
+    type Target = [DVec3];
+
+    fn deref(&self) -> &[DVec3] {
+        &self.points[..self.count]
+    }
 }
 
 /// The material of a face and its place in the order of all faces.
@@ -36,13 +53,20 @@ impl FlatFaces {
     /// Adds the six faces of a parallelepiped at the end; returns their corners.
     pub(super) fn push_box(&mut self, solid: &Parallelepiped, first_rank: u32) -> [[DVec3; 4]; 6] {
         let faces = box_faces(solid);
-        self.corners.extend(faces.as_flattened());
+        self.push_points(faces.as_flattened());
         self.box_edges.extend(box_edges(solid));
         self.attributes.extend(
             (first_rank..first_rank + 6)
                 .map(|rank| FaceAttributes { material: solid.material, rank }),
         );
         faces
+    }
+
+    /// Adds points that are a corner each.
+    pub(super) fn push_points(&mut self, points: &[DVec3]) {
+        let first = self.points.len() as u32;
+        self.points.extend(points);
+        self.corners.extend(first..self.points.len() as u32);
     }
 
     /// How many flat faces are items of their own.
@@ -60,10 +84,21 @@ impl FlatFaces {
         self.attributes.len()
     }
 
-    /// The corners of a face, three or four.
-    pub(super) fn corners_of(&self, face: usize) -> &[DVec3] {
-        let range = self.corner_range(face);
-        &self.corners[range]
+    /// The corners of a face.
+    #[inline]
+    pub(super) fn corners_of(&self, face: usize) -> Corners {
+        let corners = &self.corners[self.corner_range(face)];
+        let mut points = [DVec3::ZERO; 4];
+        for (point, &corner) in points.iter_mut().zip(corners) {
+            *point = self.points[corner as usize];
+        }
+        Corners { points, count: corners.len() }
+    }
+
+    /// The corners of the faces of parallelepipeds in solids.
+    pub(super) fn box_corners(&self) -> Vec<DVec3> {
+        let corners = &self.corners[self.item_corner_count()..];
+        corners.iter().map(|&corner| self.points[corner as usize]).collect()
     }
 
     /// The places of a face's corners among all corners.
@@ -83,7 +118,7 @@ impl FlatFaces {
                 let [u, v] = self.box_edges[of_box];
                 unit_normal(&[DVec3::ZERO, u, v])
             }
-            None => unit_normal(self.corners_of(face)),
+            None => unit_normal(&self.corners_of(face)),
         }
     }
 

@@ -4,7 +4,7 @@ use glam::DVec3;
 use rayon::prelude::*;
 
 use super::{
-    bvh::{Bounds, BuildPrimitive, build_bvh},
+    bvh::{BuildPrimitive, build_bvh},
     flat::bounds_of,
     surfaces::Surfaces,
 };
@@ -30,17 +30,20 @@ impl Hierarchy {
         let mut primitives = build_primitives(surfaces, &frame);
         let first_solid = surfaces.flat.item_count() + surfaces.spheres.len();
         let nodes = build_bvh(&mut primitives, first_solid as u32);
-        let order = primitives.into_iter().map(|primitive| primitive.item).collect();
+        let order = primitives.into_iter().map(|primitive| primitive.item()).collect();
         Self { frame, nodes, order }
     }
 }
 
 /// The frame around everything.
 fn frame_around(surfaces: &Surfaces) -> Frame {
-    let flat = &surfaces.flat.corners[..surfaces.flat.item_corner_count()];
-    let points = flat.iter().map(|&corner| (corner, corner)).chain(round_bounds(surfaces));
+    let flat = &surfaces.flat;
+    let points = flat.corners[..flat.item_corner_count()].iter().map(|&corner| {
+        let point = flat.points[corner as usize];
+        (point, point)
+    });
     let (mut min, mut max) = (DVec3::INFINITY, DVec3::NEG_INFINITY);
-    for (low, high) in points {
+    for (low, high) in points.chain(round_bounds(surfaces)) {
         (min, max) = (min.min(low), max.max(high));
     }
     if min.x > max.x {
@@ -68,22 +71,20 @@ fn round_bounds(surfaces: &Surfaces) -> impl Iterator<Item = (DVec3, DVec3)> {
 fn build_primitives(surfaces: &Surfaces, frame: &Frame) -> Vec<BuildPrimitive> {
     let flat = &surfaces.flat;
     let origin = DVec3::from_array(frame.origin);
-    let bounds = |(min, max): (DVec3, DVec3)| {
+    let primitive = |(min, max): (DVec3, DVec3), item| {
         // Rounding to f64 must not pull a box in.
         let relative = |point: DVec3| ((point - origin) * frame.scale).to_array();
-        Bounds {
-            min: relative(min).map(|x| below(x - x.abs() * f64::EPSILON)),
-            max: relative(max).map(|x| above(x + x.abs() * f64::EPSILON)),
-        }
+        BuildPrimitive::new(
+            relative(min).map(|x| below(x - x.abs() * f64::EPSILON)),
+            relative(max).map(|x| above(x + x.abs() * f64::EPSILON)),
+            item,
+        )
     };
     let mut primitives: Vec<BuildPrimitive> = (0..flat.item_count())
         .into_par_iter()
-        .map(|face| BuildPrimitive {
-            bounds: bounds(bounds_of(flat.corners_of(face))),
-            item: face as u32,
-        })
+        .map(|face| primitive(bounds_of(&flat.corners_of(face)), face as u32))
         .collect();
     let round = round_bounds(surfaces).zip(flat.item_count() as u32..);
-    primitives.extend(round.map(|(round, item)| BuildPrimitive { bounds: bounds(round), item }));
+    primitives.extend(round.map(|(round, item)| primitive(round, item)));
     primitives
 }

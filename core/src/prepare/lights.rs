@@ -40,7 +40,7 @@ impl Lights {
 /// The surfaces that a point lies on, within rounding.
 fn surfaces_at(point: DVec3, faces: &Sorted) -> Vec<Surface> {
     let mut surfaces = Vec::new();
-    let mut add_flat = |corners: &[u32], normal: DVec3, surface: Surface| {
+    let mut add_flat = |corners: &[u32], normal: &dyn Fn() -> DVec3, surface: Surface| {
         let mut points = [DVec3::ZERO; 4];
         for (point, &corner) in points.iter_mut().zip(corners) {
             *point = DVec3::from_array(faces.vertices[corner as usize]);
@@ -48,21 +48,22 @@ fn surfaces_at(point: DVec3, faces: &Sorted) -> Vec<Surface> {
         let (min, max) = bounds_of(&points[..corners.len()]);
         let blur = 8.0 * f64::EPSILON * (max.abs().max(min.abs()).max(point.abs()));
         let is_within = point.cmpge(min - blur).all() && point.cmple(max + blur).all();
-        if is_within && normal.dot(point - points[0]).abs() <= blur.max_element() {
+        if is_within && normal().dot(point - points[0]).abs() <= blur.max_element() {
             surfaces.push(surface);
         }
     };
     for triangle in &faces.triangles {
-        let corners = triangle.vertices.map(|v| DVec3::from_array(faces.vertices[v as usize]));
-        add_flat(&triangle.vertices, triangle_normal(corners), Surface(triangle.rank));
+        let corner = |v: u32| DVec3::from_array(faces.vertices[v as usize]);
+        let normal = || triangle_normal(triangle.vertices.map(corner));
+        add_flat(&triangle.vertices, &normal, Surface(triangle.rank));
     }
     for face in &faces.coplanars {
-        let normal = DVec3::from_array(faces.planes[face.plane.index()].normal);
-        add_flat(&face.vertices, normal, face.plane.surface());
+        let normal = || DVec3::from_array(faces.planes[face.plane.index()].normal);
+        add_flat(&face.vertices, &normal, face.plane.surface());
     }
     for face in &faces.quadrangles {
-        let normal = DVec3::from_array(faces.planes[face.plane.index()].normal);
-        add_flat(&face.vertices, normal, face.plane.surface());
+        let normal = || DVec3::from_array(faces.planes[face.plane.index()].normal);
+        add_flat(&face.vertices, &normal, face.plane.surface());
     }
     let is_on_sphere = |center: [f64; 3], radius: f64| {
         let blur = 8.0 * f64::EPSILON * (radius + point.abs().max_element());

@@ -6,13 +6,13 @@
 //! in one plane, and so do all faces that such pairs join, if they are as near to the largest of
 //! them. The order of the faces has no part in it.
 
-use std::collections::HashMap;
+use std::{collections::HashMap, ops::Range};
 
 use glam::{DVec2, DVec3};
 use rayon::prelude::*;
 
 use super::{
-    flat::{FlatFaces, bounds_of},
+    flat::{Corners, FlatFaces, bounds_of},
     ranks::Ranks,
 };
 use crate::exact::clip::clip;
@@ -37,12 +37,10 @@ pub(super) fn near_sets(
     exact: impl Fn(usize) -> Option<usize>,
 ) -> Vec<Vec<usize>> {
     let primitive = |face: usize| ranks.primitive(flat.rank(face));
-    if (1..flat.count()).all(|face| primitive(face) == primitive(0)) {
-        return Vec::new();
-    }
     let mut overlaps = Vec::new();
     let mut pairs_left = MOST_PAIRS;
-    for cluster in clusters(&mut keys(flat)) {
+    let mut keys = keys(flat, &meeting_others(flat, ranks));
+    for cluster in clusters(&mut keys) {
         let first = exact(cluster[0].face);
         if first.is_some() && cluster.iter().all(|key| exact(key.face) == first) {
             continue;
@@ -57,26 +55,82 @@ pub(super) fn near_sets(
     if overlaps.is_empty() { Vec::new() } else { join(flat, &overlaps, exact) }
 }
 
+/// The box around some points, as its least and its greatest corner.
+type Bounds = (DVec3, DVec3);
+
+const NOTHING: Bounds = (DVec3::INFINITY, DVec3::NEG_INFINITY);
+
+fn joined(a: Bounds, b: Bounds) -> Bounds {
+    (a.0.min(b.0), a.1.max(b.1))
+}
+
+fn is_apart(a: Bounds, b: Bounds) -> bool {
+    (a.0.cmpgt(b.1) | b.0.cmpgt(a.1)).any()
+}
+
+/// A primitive of fewer faces is not looked at by itself.
+const LARGE: usize = 256;
+
+/// The faces that may overlap one of another primitive: of a large primitive only those in the box
+/// around all others.
+fn meeting_others(flat: &FlatFaces, ranks: &Ranks) -> Vec<u32> {
+    let bounds = |face: usize| bounds_of(&flat.corners_of(face));
+    let bounds_of_run =
+        |run: &Range<usize>| run.clone().into_par_iter().map(bounds).reduce(|| NOTHING, joined);
+    // Large primitives with their boxes, and the faces of all others.
+    let (mut large, mut small) = (Vec::new(), Vec::new());
+    let mut start = 0;
+    while start < flat.count() {
+        let ranks = ranks.of(ranks.primitive(flat.rank(start)));
+        let faces = &flat.attributes[start..];
+        let length = faces.iter().take_while(|face| ranks.contains(&face.rank)).count();
+        let run = start..start + length;
+        start = run.end;
+        if length >= LARGE {
+            large.push((run.clone(), bounds_of_run(&run)));
+        } else {
+            small.extend(run.map(|face| face as u32));
+        }
+    }
+    let mut before = small.iter().map(|&face| bounds(face as usize)).fold(NOTHING, joined);
+    let mut others: Vec<Bounds> = Vec::with_capacity(large.len());
+    for &(_, own) in &large {
+        others.push(before);
+        before = joined(before, own);
+    }
+    let mut behind = NOTHING;
+    for ((_, own), others) in large.iter().zip(&mut others).rev() {
+        *others = joined(*others, behind);
+        behind = joined(behind, *own);
+    }
+    for ((run, _), others) in large.into_iter().zip(others) {
+        let meets = |&face: &usize| !is_apart(bounds(face), others);
+        small.extend(run.filter(meets).map(|face| face as u32));
+    }
+    small
+}
+
 /// A face by a number that planes have nearly in common if they are nearly the same, from the least
 /// to the greatest that rounding may make of it, and the box around the face.
 struct Key {
     face: usize,
     from: f64,
     to: f64,
-    bounds: (DVec3, DVec3),
+    bounds: Bounds,
 }
 
-/// The keys of all faces, by their least numbers, but for faces so thin that any plane could be theirs.
-fn keys(flat: &FlatFaces) -> Vec<Key> {
+/// The keys of some faces, by their least numbers, but for faces so thin that any plane could be theirs.
+fn keys(flat: &FlatFaces, faces: &[u32]) -> Vec<Key> {
     // A direction that no modeller prefers.
     const DIRECTION: DVec3 = DVec3::new(0.483, 0.836, 0.259);
-    let key = |face: usize| {
+    let key = |&face: &u32| {
+        let face = face as usize;
         let corners = flat.corners_of(face);
         let (first, last) = (corners[0], corners[corners.len() - 1]);
         // The diagonals of a quadrangle, two sides of a triangle.
         let (u, v) = (corners[2] - first, corners[1] - last);
         let cross = u.cross(v);
-        let bounds = bounds_of(corners);
+        let bounds = bounds_of(&corners);
         let extent = bounds.0.abs().max(bounds.1.abs()).max_element();
         // What roundings of the corners turn the normal by, and what that moves the plane by.
         let turn = 16.0 * ROUNDING * extent * (u.length() + v.length()) / cross.length();
@@ -85,7 +139,7 @@ fn keys(flat: &FlatFaces) -> Vec<Key> {
         let number = (cross.normalize().dot(DIRECTION) + cross.normalize().dot(first)).abs();
         (slack < 1e-3).then_some(Key { face, from: number - slack, to: number + slack, bounds })
     };
-    let mut keys: Vec<Key> = (0..flat.count()).into_par_iter().filter_map(key).collect();
+    let mut keys: Vec<Key> = faces.par_iter().filter_map(key).collect();
     keys.par_sort_unstable_by(|a, b| a.from.total_cmp(&b.from).then(a.face.cmp(&b.face)));
     keys
 }
@@ -106,9 +160,7 @@ fn clusters(keys: &mut [Key]) -> impl Iterator<Item = &mut [Key]> {
 
 /// Calls `visit` with every two faces whose boxes meet: they are swept along one axis.
 fn for_each_pair(cluster: &mut [Key], pairs_left: &mut u64, mut visit: impl FnMut(usize, usize)) {
-    let none = (DVec3::INFINITY, DVec3::NEG_INFINITY);
-    let (min, max) = (cluster.iter())
-        .fold(none, |(min, max), key| (min.min(key.bounds.0), max.max(key.bounds.1)));
+    let (min, max) = cluster.iter().map(|key| key.bounds).fold(NOTHING, joined);
     let axis = (max - min).max_position();
     cluster.sort_unstable_by(|a, b| {
         a.bounds.0[axis].total_cmp(&b.bounds.0[axis]).then(a.face.cmp(&b.face))
@@ -119,8 +171,7 @@ fn for_each_pair(cluster: &mut [Key], pairs_left: &mut u64, mut visit: impl FnMu
         for other in &open {
             let Some(left) = pairs_left.checked_sub(1) else { return };
             *pairs_left = left;
-            let is_apart = key.bounds.0.cmpgt(other.bounds.1) | other.bounds.0.cmpgt(key.bounds.1);
-            if !is_apart.any() {
+            if !is_apart(key.bounds, other.bounds) {
                 visit(key.face, other.face);
             }
         }
@@ -153,13 +204,13 @@ impl Overlap {
 }
 
 /// A face and its plane.
-struct Plane<'a> {
-    corners: &'a [DVec3],
+struct Plane {
+    corners: Corners,
     normal: DVec3,
 }
 
-impl<'a> Plane<'a> {
-    fn of(flat: &'a FlatFaces, face: usize) -> Self {
+impl Plane {
+    fn of(flat: &FlatFaces, face: usize) -> Self {
         Self { corners: flat.corners_of(face), normal: flat.normal(face) }
     }
 
@@ -335,7 +386,8 @@ mod tests {
         });
         let attributes = (0..places.len() as u32).map(|rank| FaceAttributes { material: 0, rank });
         FlatFaces {
-            corners: corners.collect(),
+            corners: (0..4 * places.len() as u32).collect(),
+            points: corners.collect(),
             attributes: attributes.collect(),
             triangle_count: 0,
             quadrangle_count: places.len(),
@@ -358,6 +410,18 @@ mod tests {
         assert_eq!(sets(&[(0.0, 0.0), (16.0, 0.5)]), [[0; 0]; 0], "too far apart");
         assert_eq!(sets(&[(0.0, 0.0), (1.5, 1.0)]), [[0; 0]; 0], "they only touch");
         assert_eq!(sets(&[(0.0, 0.0), (1.5, 7.0), (1.0, 0.5), (0.0, 7.5)]), [[0, 2], [1, 3]]);
+    }
+
+    #[test]
+    fn a_label_finds_the_face_of_a_large_primitive_that_it_lies_on() {
+        let mut places: Vec<(f64, f64)> = (0..400).map(|k| (0.0, 10.0 * f64::from(k))).collect();
+        places.push((1.5, 1230.5));
+        let flat = squares(&places);
+        let ranks = Ranks { firsts: vec![0, 400] };
+        assert_eq!(meeting_others(&flat, &ranks), [400, 123]);
+        let mut sets = near_sets(&flat, &ranks, |_| None);
+        sets[0].sort_unstable();
+        assert_eq!(sets, [[123, 400]]);
     }
 
     #[test]

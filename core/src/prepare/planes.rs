@@ -28,11 +28,11 @@ pub(super) struct SharedPlanes {
 }
 
 /// Gives flat faces in one plane one record: that of the face that comes first where the plane is
-/// exactly one, that of the largest where it is one within rounding. `first_corners` has for each corner the first one in the same place.
-pub(super) fn share_planes(flat: &FlatFaces, ranks: &Ranks, first_corners: &[u32]) -> SharedPlanes {
+/// exactly one, that of the largest where it is one within rounding.
+pub(super) fn share_planes(flat: &FlatFaces, ranks: &Ranks) -> SharedPlanes {
     let mut sharing = Sharing { flat, of_faces: vec![None; flat.count()], planes: Vec::new() };
     sharing.share_exact_planes();
-    sharing.share_outlines(first_corners);
+    sharing.share_outlines();
     sharing.share_near_planes(ranks);
     let Sharing { of_faces: mut of_triangles, planes, .. } = sharing;
     let every = |faces: Vec<Option<PlaneIndex>>| -> Vec<PlaneIndex> {
@@ -84,13 +84,13 @@ impl Sharing<'_> {
 
     /// Gives the other quadrangles, which are flat only within rounding, a record each; those with
     /// the same corners share it.
-    fn share_outlines(&mut self, first_corners: &[u32]) {
+    fn share_outlines(&mut self) {
         let flat = self.flat;
         let mut by_corners: Vec<([u32; 4], u32, usize)> = (flat.triangle_count..flat.count())
             .filter(|&face| self.of_faces[face].is_none())
             .map(|face| {
                 let mut corners = [0; 4];
-                corners.copy_from_slice(&first_corners[flat.corner_range(face)]);
+                corners.copy_from_slice(&flat.corners[flat.corner_range(face)]);
                 corners.sort_unstable();
                 (corners, flat.rank(face), face)
             })

@@ -1,6 +1,6 @@
 //! The order of all faces.
 
-use std::collections::HashMap;
+use std::{collections::HashMap, ops::Range};
 
 use super::error::PrepareError;
 use crate::{
@@ -56,6 +56,16 @@ impl Ranks {
         match self.firsts.partition_point(|&first| first <= rank) {
             0 => rank,
             after => after as u32 - 1,
+        }
+    }
+
+    /// The ranks of a primitive's faces.
+    pub(super) fn of(&self, primitive: u32) -> Range<u32> {
+        let first = self.first(primitive);
+        match self.firsts.get(primitive as usize + 1) {
+            Some(&next) => first..next,
+            None if self.firsts.is_empty() => first..first + 1,
+            None => first..u32::MAX,
         }
     }
 

@@ -24,7 +24,7 @@ impl Collected {
     pub(super) fn scale(self, other_extent: f64) -> Scaled {
         let scale = power_of_two_below_inverse(self.extent().max(other_extent));
         let Self { mut flat, mut spheres, mut solids } = self;
-        flat.corners.iter_mut().for_each(|corner| *corner *= scale);
+        flat.points.iter_mut().for_each(|point| *point *= scale);
         for sphere in &mut spheres {
             sphere.center = sphere.center.map(|x| x * scale);
             sphere.radius *= scale;
@@ -42,7 +42,8 @@ impl Collected {
     /// The largest coordinate.
     fn extent(&self) -> f64 {
         let of_sphere = |center: DVec3, radius: f64| center.abs().max_element().max(radius);
-        (self.flat.corners.iter().map(|corner| corner.abs().max_element()))
+        let of_corner = |&corner: &u32| self.flat.points[corner as usize].abs().max_element();
+        (self.flat.corners.iter().map(of_corner))
             .chain(
                 (self.spheres.iter())
                     .map(|sphere| of_sphere(DVec3::from_array(sphere.center), sphere.radius)),

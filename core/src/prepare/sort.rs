@@ -38,7 +38,7 @@ pub(super) struct Sorted {
 impl Surfaces {
     /// Makes the records of all items, in this order of their numbers.
     pub(super) fn sort(self, order: &[u32]) -> Sorted {
-        let Self { mut flat, solids: solids_in_file_order, .. } = self;
+        let Self { flat, solids: solids_in_file_order, .. } = self;
         let mut items = Vec::with_capacity(order.len());
         let mut vertices = Vec::new();
         let mut triangles = Vec::new();
@@ -46,7 +46,7 @@ impl Surfaces {
         let mut quadrangles = Vec::new();
         let mut spheres = Vec::new();
         let mut solids = Vec::new();
-        let mut numbers = vec![u32::MAX; flat.corners.len()];
+        let mut numbers = vec![u32::MAX; flat.points.len()];
         for &item in order {
             let face = item as usize;
             if let Some(round) = face.checked_sub(flat.item_count()) {
@@ -60,11 +60,11 @@ impl Surfaces {
                 continue;
             }
             let mut corners = [0; 4];
-            for (slot, corner) in corners.iter_mut().zip(flat.corner_range(face)) {
-                let number = &mut numbers[self.first_corners[corner] as usize];
+            for (slot, &point) in corners.iter_mut().zip(&flat.corners[flat.corner_range(face)]) {
+                let number = &mut numbers[point as usize];
                 if *number == u32::MAX {
                     *number = vertices.len() as u32;
-                    vertices.push(flat.corners[corner].to_array());
+                    vertices.push(flat.points[point as usize].to_array());
                 }
                 *slot = *number;
             }
@@ -82,7 +82,6 @@ impl Surfaces {
                 triangles.push(TriangleRecord { vertices: [a, b, c], material, rank });
             }
         }
-        let box_corners = flat.corners.split_off(flat.item_corner_count());
         Sorted {
             items,
             vertices,
@@ -98,7 +97,7 @@ impl Surfaces {
             solid_boxes: self.solid_boxes,
             solids_in_file_order,
             solid_bounds: self.solid_bounds,
-            box_corners,
+            box_corners: flat.box_corners(),
         }
     }
 }

@@ -20,8 +20,6 @@ use glam::DVec3;
 /// All faces of a scene, with the vertices and the surfaces that they share.
 pub(super) struct Surfaces {
     pub(super) flat: FlatFaces,
-    /// For every corner of a flat face, the first corner in the same place.
-    pub(super) first_corners: Vec<u32>,
     /// The planes of triangles; `None` for one that is alone in its plane.
     pub(super) triangle_planes: Vec<Option<PlaneIndex>>,
     /// The planes of all quadrangles that are items of their own.
@@ -42,9 +40,9 @@ pub(super) struct Surfaces {
 impl Welded {
     /// Finds the surfaces that faces share.
     pub(super) fn share_surfaces(self, ranks: &Ranks) -> Surfaces {
-        let Self { flat, mut spheres, solids, first_corners } = self;
+        let Self { flat, mut spheres, solids } = self;
         let SharedPlanes { of_triangles, of_quadrangles, of_boxes, planes } =
-            share_planes(&flat, ranks, &first_corners);
+            share_planes(&flat, ranks);
         let sphere_surfaces = share_spheres(&mut spheres, &solids);
         let SolidTrees { mut solids, bounds, nodes, leaves } = solids;
         let leaf_bounds = leaf_bounds(&leaves, &flat);
@@ -82,7 +80,6 @@ impl Welded {
         }
         Surfaces {
             flat,
-            first_corners,
             triangle_planes: of_triangles,
             quadrangle_planes: of_quadrangles,
             planes,
@@ -99,7 +96,8 @@ impl Welded {
 
 /// A box around each leaf of a solid.
 fn leaf_bounds(leaves: &[Leaf], flat: &FlatFaces) -> Vec<(DVec3, DVec3)> {
-    let mut box_corners = flat.corners[flat.item_corner_count()..].chunks(6 * 4);
+    let box_corners = flat.box_corners();
+    let mut box_corners = box_corners.chunks(6 * 4);
     let mut bounds = |leaf: &Leaf| {
         if leaf.is_box() {
             bounds_of(box_corners.next().expect("as many as there are boxes among the leaves"))

@@ -10,60 +10,59 @@ use crate::{
     prepared::record::SphereRecord,
 };
 
-/// All faces of a scene, with the corners that they share.
+/// All faces of a scene; corners in one place have one point.
 pub(super) struct Welded {
     pub(super) flat: FlatFaces,
     pub(super) spheres: Vec<SphereRecord>,
     pub(super) solids: SolidTrees,
-    /// For every corner of a flat face, the first corner in the same place.
-    pub(super) first_corners: Vec<u32>,
 }
 
 impl Scaled {
     /// Finds the corners that faces share.
     pub(super) fn weld(self) -> Welded {
-        let Self { flat, spheres, solids, .. } = self;
-        let first_corners = find_first_corners(&flat.corners);
-        Welded { flat, spheres, solids, first_corners }
+        let Self { mut flat, spheres, solids, .. } = self;
+        let firsts = find_firsts(&flat.points);
+        flat.corners.iter_mut().for_each(|corner| *corner = firsts[*corner as usize]);
+        Welded { flat, spheres, solids }
     }
 }
 
-/// For every corner, the first corner with the same coordinates, bit for bit.
-fn find_first_corners(corners: &[DVec3]) -> Vec<u32> {
-    // Each thread keeps the corners of one share of all hashes; a corner's share depends on its
+/// For every point, the first point with the same coordinates, bit for bit.
+fn find_firsts(points: &[DVec3]) -> Vec<u32> {
+    // Each thread keeps the points of one share of all hashes; a point's share depends on its
     // coordinates alone, so the answer does not depend on the number of shares.
-    let shares = if corners.len() < 1 << 14 { 1 } else { rayon::current_num_threads() as u64 };
+    let shares = if points.len() < 1 << 14 { 1 } else { rayon::current_num_threads() as u64 };
     let hasher = PointHasher::new();
-    let hashes: Vec<u64> = corners.par_iter().map(|&corner| hasher.hash(bits_of(corner))).collect();
+    let hashes: Vec<u64> = points.par_iter().map(|&point| hasher.hash(bits_of(point))).collect();
     let copies: Vec<Vec<(u32, u32)>> = (0..shares)
         .into_par_iter()
         .map(|share| {
             let mut table = PointTable::new(hasher.clone(), 0);
             let mut copies = Vec::new();
-            for (corner, &hash) in (0_u32..).zip(&hashes) {
+            for (point, &hash) in (0_u32..).zip(&hashes) {
                 if (hash >> 32) % shares != share {
                     continue;
                 }
-                let bits_at = |corner: u32| bits_of(corners[corner as usize]);
-                match table.entry_with_hash(hash, bits_at(corner), bits_at) {
-                    Entry::Occupied(first) => copies.push((corner, *first.get())),
+                let bits_at = |point: u32| bits_of(points[point as usize]);
+                match table.entry_with_hash(hash, bits_at(point), bits_at) {
+                    Entry::Occupied(first) => copies.push((point, *first.get())),
                     Entry::Vacant(place) => {
-                        place.insert(corner);
+                        place.insert(point);
                     }
                 }
             }
             copies
         })
         .collect();
-    let mut firsts: Vec<u32> = (0..corners.len() as u32).collect();
+    let mut firsts: Vec<u32> = (0..points.len() as u32).collect();
     for (copy, first) in copies.into_iter().flatten() {
         firsts[copy as usize] = first;
     }
     firsts
 }
 
-fn bits_of(corner: DVec3) -> PointBits {
-    corner.to_array().map(f64::to_bits)
+fn bits_of(point: DVec3) -> PointBits {
+    point.to_array().map(f64::to_bits)
 }
 
 #[cfg(test)]
@@ -76,7 +75,7 @@ mod tests {
             (0..100_000).map(|k| DVec3::new(f64::from(k % 1000), f64::from(k % 7), 0.1)).collect();
         for threads in [1, 2, 5] {
             let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-            let firsts = pool.install(|| find_first_corners(&corners));
+            let firsts = pool.install(|| find_firsts(&corners));
             for (corner, &first) in firsts.iter().enumerate() {
                 assert_eq!(corners[corner], corners[first as usize]);
                 assert_eq!(first as usize, corner % 7000);

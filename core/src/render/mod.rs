@@ -5,6 +5,7 @@
 //! away and the first eight of those beside it, on the faces in its beam, and on its own later
 //! samples. So a pixel is the same to the bit whatever the tile, the batch, the thread or the CPU.
 
+mod camera_rays;
 mod pixel;
 mod sampler;
 mod settings;

@@ -5,11 +5,12 @@ use std::ops::{ControlFlow, Range};
 use glam::DVec3;
 
 use super::{
+    camera_rays::CameraSample,
     pixel::{Estimate, Neighbourhood, Pixel, Runs, Wanted},
     settings::{Quality, Sampling},
     tally::Tally,
     unseen::{FirstSample, UnseenFaces, UnseenSearch},
-    wavefront::{CameraSample, Wavefront},
+    wavefront::Wavefront,
 };
 use crate::{
     isa::Isa,
@@ -241,7 +242,7 @@ impl<'a> Sampler<'a> {
                         CameraSample { x, y, sample, width }
                     })
                 });
-                self.wavefront.start(self.view, self.quality, area.frame(), samples);
+                self.wavefront.start(self.view, self.quality, self.isa, area.frame(), samples);
                 self.tally.samples += (pixels.len() * part.len()) as u64;
                 self.tally.rays +=
                     self.wavefront.run(self.view, self.quality, self.isa, self.on_progress)?;

@@ -9,21 +9,25 @@ use std::ops::ControlFlow;
 
 use glam::DVec3;
 
-use super::settings::Quality;
+use super::{
+    camera_rays::{CameraRays, CameraSample},
+    settings::Quality,
+};
 use crate::{
     isa::Isa,
     left_out,
     light::gather::{Gatherer, MOST_CROSSINGS},
-    prepared::{layout::View, record::Surface},
+    prepared::layout::View,
     sample::{Sample, node_after},
     shade::{
         optics::{mirror, refract},
-        point::{Interaction, Point},
+        point::{FlatFace, Interaction, Point},
         ray_differential::RayDifferential,
     },
     tile::Size,
     trace::{
         batch::{OnProgress, trace, trace_shadows},
+        kernels::run_in_lanes,
         ray::{Hit, Ray},
     },
 };
@@ -38,22 +42,12 @@ const FULL_WEIGHT: f64 = 1.0 / 256.0;
 /// A queue of more rays than this is worked through in parts, as long as it has several samples.
 const MOST_RAYS: usize = 4096;
 
-/// A camera ray that is wanted.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct CameraSample {
-    /// The pixel's column.
-    pub(super) x: u32,
-    /// The pixel's row.
-    pub(super) y: u32,
-    /// Its random numbers.
-    pub(super) sample: Sample,
-    /// The side of the square that it stands for, in pixels.
-    pub(super) width: f64,
-}
-
 /// Samples on their way, and the queues that they pass through.
 #[derive(Debug, Default)]
 pub(super) struct Wavefront {
+    camera_samples: Vec<CameraSample>,
+    /// From the eye to the screen, for each camera ray; empty in a scene without textures.
+    targets: Vec<DVec3>,
     /// The random numbers of each sample; empty where none are needed.
     samples: Vec<Sample>,
     /// The rays of the current depth, and those of the next. A sample's rays stand together.
@@ -207,36 +201,38 @@ impl Wavefront {
         &mut self,
         view: &View<'_>,
         quality: &Quality,
+        isa: Isa,
         frame: Size,
         samples: impl Iterator<Item = CameraSample>,
     ) {
         let camera = &view.header.camera;
         let needs_numbers = gathers(view, quality) || view.header.features.has_branches();
         let has_textures = view.header.features.has_textures();
-        let screen = [camera.top_left, camera.right, camera.down].map(DVec3::from_array);
         self.queue.clear();
         self.samples.clear();
-        samples.for_each(|CameraSample { x, y, sample, width }| {
-            if needs_numbers {
-                self.samples.push(sample);
-            }
-            let [across, down] = sample.position();
-            let u = (f64::from(x) + across) / f64::from(frame.width());
-            let v = (f64::from(y) + down) / f64::from(frame.height());
-            let direction = screen[0] + u * screen[1] + v * screen[2];
-            if has_textures {
-                let steps = [(1, frame.width()), (2, frame.height())]
-                    .map(|(side, count)| screen[side] * (width / f64::from(count)));
-                self.queue.differentials.push(RayDifferential::of_camera(direction, steps));
-            }
-            self.queue.rays.push(Ray {
-                origin: DVec3::from_array(camera.eye),
-                direction: direction / direction.length(),
-                reach: f64::INFINITY,
-                leaving: Surface::NONE,
-                after: Ray::NOTHING_AHEAD,
-            });
-        });
+        self.camera_samples.clear();
+        self.camera_samples.extend(samples);
+        if needs_numbers {
+            self.samples.extend(self.camera_samples.iter().map(|camera| camera.sample));
+        }
+        self.targets.clear();
+        let mut camera_rays = CameraRays {
+            camera,
+            frame,
+            samples: &self.camera_samples,
+            rays: &mut self.queue.rays,
+            targets: has_textures.then_some(&mut self.targets),
+        };
+        run_in_lanes(isa, &mut camera_rays);
+        let differential = |(sample, &target): (&CameraSample, &DVec3)| {
+            let step = |side: [f64; 3], count: u32| {
+                DVec3::from_array(side) * (sample.width / f64::from(count))
+            };
+            let steps = [step(camera.right, frame.width()), step(camera.down, frame.height())];
+            RayDifferential::of_camera(target, steps)
+        };
+        let seen = self.camera_samples.iter().zip(&self.targets);
+        self.queue.differentials.extend(seen.map(differential));
         let count = self.queue.rays.len();
         let branch = |sample| Branch { sample, weight: 1.0, node: 0, depth: 0 };
         self.queue.branches.extend((0..count).map(branch));
@@ -269,11 +265,11 @@ impl Wavefront {
                 self.put_off.push(later);
             }
             trace(view, isa, &self.queue.rays, &mut self.hits, on_progress)?;
-            if std::mem::take(&mut is_first) {
-                self.first_hits.clone_from(&self.hits);
-            }
             ray_count += self.queue.rays.len() as u64;
             self.meet_all(view);
+            if std::mem::take(&mut is_first) {
+                std::mem::swap(&mut self.first_hits, &mut self.hits);
+            }
             ray_count += self.light_points(view, quality.flat, isa, on_progress)?;
             if gathers(view, quality) {
                 ray_count += self.gather(view, isa, on_progress)?;
@@ -296,23 +292,30 @@ impl Wavefront {
         self.points.clear();
         self.next_queue.clear();
         self.roulette = Roulette::default();
+        let mut last = None;
         for index in 0..self.queue.rays.len() {
             if !self.hits[index].is_some() {
                 let branch = &self.queue.branches[index];
                 self.colors[branch.sample] += branch.weight * background;
             } else if has_textures {
-                self.meet::<true>(view, index);
+                self.meet::<true>(view, index, &mut last);
             } else {
-                self.meet::<false>(view, index);
+                self.meet::<false>(view, index, &mut last);
             }
         }
     }
 
-    /// Ray `index` has met a face: finds the surface, shades it, and branches.
+    /// Ray `index` has met a face: finds the surface, shades it, and branches. `last` is the last
+    /// flat face that was met.
     #[inline(always)]
-    fn meet<const HAS_TEXTURES: bool>(&mut self, view: &View<'_>, index: usize) {
+    fn meet<'a, const HAS_TEXTURES: bool>(
+        &mut self,
+        view: &View<'a>,
+        index: usize,
+        last: &mut Option<FlatFace<'a>>,
+    ) {
         let (ray, branch) = (self.queue.rays[index], self.queue.branches[index]);
-        let at = Interaction::new(view, &ray, &self.hits[index]);
+        let at = Interaction::with_last(view, &ray, &self.hits[index], last);
         let differential = HAS_TEXTURES
             .then(|| self.queue.differentials[index].transfer(ray.direction, at.t, at.normal));
         self.shade(view, &ray, branch, &at, differential);
@@ -466,30 +469,36 @@ impl Wavefront {
         let light = &view.lights[index];
         let [position, intensity] = [light.position, light.intensity].map(DVec3::from_array);
         let on_light = view.coincident_surfaces(light);
-        self.shadow_rays.clear();
-        self.arrivals.clear();
+        // Every point writes a ray, and the next one writes over it unless light may arrive.
+        let most = self.points.len();
+        if self.shadow_rays.len() < most {
+            self.shadow_rays.resize(most, Ray::NOWHERE);
+            self.arrivals.resize(most, (0, DVec3::ZERO));
+        }
+        let (shadow_rays, arrivals) = (&mut self.shadow_rays[..most], &mut self.arrivals[..most]);
+        let mut count = 0;
         for (k, point) in self.points.iter().enumerate() {
             let to_light = position - point.position;
             let height = point.normal.dot(to_light);
+            let distance = to_light.length();
+            arrivals[count] = (k, intensity * (height / (distance * distance * distance)));
+            shadow_rays[count] = Ray {
+                origin: point.position,
+                direction: to_light / distance,
+                reach: distance,
+                leaving: point.surface,
+                after: Ray::NOTHING_AHEAD,
+            };
             // Where the light is on the surface the height is rounding, but the distance may be
             // as small.
-            if height > 0.0 && !on_light.contains(&point.surface) {
-                let distance = to_light.length();
-                self.arrivals.push((k, intensity * (height / (distance * distance * distance))));
-                self.shadow_rays.push(Ray {
-                    origin: point.position,
-                    direction: to_light / distance,
-                    reach: distance,
-                    leaving: point.surface,
-                    after: Ray::NOTHING_AHEAD,
-                });
-            }
+            count += usize::from(height > 0.0 && !on_light.contains(&point.surface));
         }
-        trace_shadows(view, isa, light, &self.shadow_rays, &mut self.shares, on_progress)?;
-        for (&(point, arrival), &share) in self.arrivals.iter().zip(&self.shares) {
+        let (shadow_rays, arrivals) = (&shadow_rays[..count], &arrivals[..count]);
+        trace_shadows(view, isa, light, shadow_rays, &mut self.shares, on_progress)?;
+        for (&(point, arrival), &share) in arrivals.iter().zip(&self.shares) {
             self.points[point].light += share * arrival;
         }
-        ControlFlow::Continue(self.shadow_rays.len() as u64)
+        ControlFlow::Continue(count as u64)
     }
 }
 

@@ -31,21 +31,50 @@ pub(crate) struct Interaction<'a> {
     pub(crate) is_front: bool,
 }
 
+/// What is the same all over a flat face.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct FlatFace<'a> {
+    face: Face,
+    outward: DVec3,
+    surface: Surface,
+    material: &'a MaterialRecord,
+}
+
 impl<'a> Interaction<'a> {
     /// What stands at `hit`, which must be a hit of `ray`.
     #[inline(always)]
     pub(crate) fn new(view: &View<'a>, ray: &Ray, hit: &Hit) -> Self {
+        Self::with_last(view, ray, hit, &mut None)
+    }
+
+    /// The same. Rays that follow each other often meet one face: `last`, the last flat one, is known.
+    #[inline(always)]
+    pub(crate) fn with_last(
+        view: &View<'a>,
+        ray: &Ray,
+        hit: &Hit,
+        last: &mut Option<FlatFace<'a>>,
+    ) -> Self {
         let Hit { t, face, rank } = *hit;
         let position = ray.origin + t * ray.direction;
-        let outward = face.normal(view, position);
+        let FlatFace { outward, surface, material, .. } = match *last {
+            Some(last) if last.face == face => last,
+            _ => {
+                let (surface, material) = (face.surface(view), face.material(view));
+                let outward = face.normal(view, position);
+                let found = FlatFace { face, outward, surface, material };
+                *last = (!face.is_round(view)).then_some(found);
+                found
+            }
+        };
         let is_front = outward.dot(ray.direction) <= 0.0;
         Self {
             t,
             position,
             face,
             rank,
-            surface: face.surface(view),
-            material: face.material(view),
+            surface,
+            material,
             outward,
             normal: if is_front { outward } else { -outward },
             is_front,

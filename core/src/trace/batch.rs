@@ -6,11 +6,12 @@
 use std::ops::ControlFlow;
 
 use super::{
-    boxes::{BoxKernel, BoxRay, KernelWork},
+    box_ray::BoxRay,
+    boxes::{BoxKernel, KernelWork},
     hit::{Nearest, between, is_between, take_crossing},
     kernels::run_with_kernel,
-    lanes::MOST_RAYS,
-    packet::{Class, Meeting, Packet, PacketStack, visit_packet},
+    lanes::{CLASSES, MOST_RAYS},
+    packet::{Meeting, Packet, PacketStack, visit_packet},
     ray::{Hit, Ray, Shear},
     solid::Scratch,
     traversal::{Stack, Step, visit},
@@ -78,26 +79,32 @@ struct Order {
     /// The places of the rays.
     places: [u16; RAYS_A_REPORT],
     /// The end of the run of each class.
-    ends: [u16; Class::COUNT + 1],
+    ends: [u16; CLASSES + 1],
 }
 
 impl Order {
     #[inline(always)]
-    fn new(rays: &[Ray], frame: &Frame) -> Self {
+    fn new(kernel: impl BoxKernel, rays: &[Ray], frame: &Frame) -> Self {
         let mut classes = [0; RAYS_A_REPORT];
-        let mut ends = [0; Class::COUNT + 1];
-        for (class, ray) in classes.iter_mut().zip(rays) {
-            *class = Class::of(ray, frame).map_or(Class::COUNT, Class::index);
-            ends[*class] += 1;
+        for (classes, rays) in classes.as_chunks_mut().0.iter_mut().zip(rays.chunks(4)) {
+            let mut four = [&rays[0]; 4];
+            four.iter_mut().zip(rays).for_each(|(of_lane, ray)| *of_lane = ray);
+            *classes = kernel.classify(four, frame);
+        }
+        let classes = &classes[..rays.len()];
+        let mut ends = [0; CLASSES + 1];
+        for &class in classes {
+            ends[class as usize] += 1;
         }
         let mut end = 0;
         for count in &mut ends {
             (*count, end) = (end, end + *count);
         }
         let mut places = [0; RAYS_A_REPORT];
-        for (place, &class) in (0..rays.len() as u16).zip(&classes) {
-            places[usize::from(ends[class])] = place;
-            ends[class] += 1;
+        for (place, &class) in (0..rays.len() as u16).zip(classes) {
+            let end = &mut ends[class as usize];
+            places[usize::from(*end)] = place;
+            *end += 1;
         }
         Self { places, ends }
     }
@@ -107,7 +114,7 @@ impl Order {
         let firsts = std::iter::once(0).chain(self.ends);
         firsts.zip(self.ends).enumerate().flat_map(|(class, (first, end))| {
             let run = &self.places[usize::from(first)..usize::from(end)];
-            let is_class = class < Class::COUNT;
+            let is_class = class < CLASSES;
             run.chunks(MOST_RAYS).map(move |run| (run, is_class && run.len() >= FEWEST_RAYS))
         })
     }
@@ -131,7 +138,7 @@ impl KernelWork<View<'_>> for Trace<'_> {
             let first = self.hits.len();
             self.hits.extend(rays.iter().map(|ray| Hit::none(ray.reach)));
             let hits = &mut self.hits[first..];
-            for (members, go_together) in Order::new(rays, &view.header.frame).packets() {
+            for (members, go_together) in Order::new(kernel, rays, &view.header.frame).packets() {
                 if !go_together {
                     for &member in members {
                         let ray = &rays[usize::from(member)];
@@ -147,7 +154,7 @@ impl KernelWork<View<'_>> for Trace<'_> {
                     }
                     continue;
                 }
-                packet.fill(&view.header.frame, rays, members);
+                packet.fill(kernel, &view.header.frame, rays, members);
                 let stacks = (&mut packet_stack, &mut stack);
                 let scratch = &mut scratch;
                 let mut meeting = NearestOfPacket { view, kernel, rays, members, hits, scratch };
@@ -213,12 +220,12 @@ impl KernelWork<View<'_>> for Shadows<'_> {
             let first = self.shares.len();
             self.shares.resize(first + rays.len(), 1.0);
             let shares = &mut self.shares[first..];
-            for (members, go_together) in Order::new(rays, &view.header.frame).packets() {
+            for (members, go_together) in Order::new(kernel, rays, &view.header.frame).packets() {
                 let (scratch, ending_on) = (&mut scratch, self.ending_on);
                 let mut meeting =
                     BlockedOfPacket { view, kernel, rays, members, ending_on, shares, scratch };
                 if go_together {
-                    packet.fill(&view.header.frame, rays, members);
+                    packet.fill(kernel, &view.header.frame, rays, members);
                     let stacks = (&mut packet_stack, &mut stack);
                     visit_packet(kernel, view, &mut packet, stacks, &mut meeting);
                     continue;

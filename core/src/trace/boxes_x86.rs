@@ -1,20 +1,28 @@
 //! The test of a ray against a node's boxes with x86-64's instructions, and those of several rays.
 
 use std::arch::x86_64::{
-    _CMP_GT_OQ, _CMP_LE_OQ, _CMP_LT_OQ, _mm_cmple_ps, _mm_loadu_ps, _mm_max_ps, _mm_min_ps,
-    _mm_movemask_ps, _mm_mul_ps, _mm_set1_ps, _mm_storeu_ps, _mm_sub_ps, _mm256_add_pd,
-    _mm256_and_pd, _mm256_andnot_pd, _mm256_cmp_pd, _mm256_cmp_ps, _mm256_div_pd, _mm256_load_pd,
-    _mm256_load_ps, _mm256_loadu_ps, _mm256_max_pd, _mm256_max_ps, _mm256_min_pd, _mm256_min_ps,
-    _mm256_movemask_pd, _mm256_movemask_ps, _mm256_mul_pd, _mm256_mul_ps, _mm256_or_pd,
-    _mm256_set1_pd, _mm256_set1_ps, _mm256_setzero_pd, _mm256_storeu_pd, _mm256_storeu_ps,
-    _mm256_sub_pd, _mm256_sub_ps,
+    __m256, __m256d, _CMP_EQ_OQ, _CMP_GE_OQ, _CMP_GT_OQ, _CMP_LE_OQ, _CMP_LT_OQ, _mm_cmple_ps,
+    _mm_loadu_ps, _mm_max_ps, _mm_min_ps, _mm_movemask_ps, _mm_mul_ps, _mm_set1_ps, _mm_storeu_ps,
+    _mm_sub_ps, _mm256_add_epi32, _mm256_add_pd, _mm256_and_pd, _mm256_and_si256, _mm256_andnot_pd,
+    _mm256_blendv_pd, _mm256_castpd_ps, _mm256_castpd_si256, _mm256_castps_si256,
+    _mm256_castps256_ps128, _mm256_castsi256_pd, _mm256_castsi256_ps, _mm256_cmp_pd, _mm256_cmp_ps,
+    _mm256_cvtpd_ps, _mm256_cvtps_pd, _mm256_div_pd, _mm256_extractf128_ps, _mm256_load_pd,
+    _mm256_load_ps, _mm256_loadu_pd, _mm256_loadu_ps, _mm256_max_pd, _mm256_max_ps, _mm256_min_pd,
+    _mm256_min_ps, _mm256_movemask_pd, _mm256_movemask_ps, _mm256_mul_pd, _mm256_mul_ps,
+    _mm256_or_pd, _mm256_or_si256, _mm256_permute2f128_pd, _mm256_permute4x64_epi64,
+    _mm256_set_m128, _mm256_set1_epi32, _mm256_set1_epi64x, _mm256_set1_pd, _mm256_set1_ps,
+    _mm256_setzero_pd, _mm256_shuffle_ps, _mm256_srai_epi32, _mm256_store_pd, _mm256_store_ps,
+    _mm256_storeu_pd, _mm256_storeu_ps, _mm256_storeu_si256, _mm256_sub_epi32, _mm256_sub_pd,
+    _mm256_sub_ps, _mm256_unpackhi_pd, _mm256_unpacklo_pd,
 };
 
 use super::{
-    boxes::{BoxKernel, BoxRay, KernelWork},
-    lanes::{Beam, Crossings, GROUPS, LANES, RayGroup},
+    box_ray::{BoxRay, FAR, NEAR, NEAR_FRAME},
+    boxes::{BoxKernel, KernelWork},
+    lanes::{Beam, CLASSES, Crossings, GROUPS, LANES, LEAST_COMPONENT, RayGroup, Turn},
+    ray::Ray,
 };
-use crate::prepared::node::Node;
+use crate::prepared::node::{Frame, Node};
 
 /// The kernel with SSE2, four boxes at a time. Every x86-64 CPU has it.
 #[derive(Debug, Clone, Copy)]
@@ -122,6 +130,91 @@ impl BoxKernel for Avx2Boxes {
     }
 
     #[inline(always)]
+    fn classify(self, rays: [&Ray; 4], frame: &Frame) -> [u64; 4] {
+        let mut classes = [0; 4];
+        // SAFETY: a value of this type says that the CPU has AVX2. The store writes four numbers of
+        // 64 bits.
+        unsafe {
+            let numbers = self.numbers_of(rays);
+            let (mut distance, mut bits) = (_mm256_setzero_pd(), _mm256_setzero_pd());
+            let mut is_plain = _mm256_cmp_pd::<_CMP_EQ_OQ>(distance, distance);
+            let mut size = [distance; 3];
+            for axis in 0..3 {
+                let relative = self.turned(numbers[axis], axis, frame);
+                distance = _mm256_add_pd(distance, _mm256_mul_pd(relative, relative));
+                let d = numbers[3 + axis];
+                size[axis] = _mm256_andnot_pd(_mm256_set1_pd(-0.0), d);
+                let least = _mm256_set1_pd(LEAST_COMPONENT);
+                is_plain = _mm256_and_pd(is_plain, _mm256_cmp_pd::<_CMP_GE_OQ>(size[axis], least));
+                let is_forward = _mm256_cmp_pd::<_CMP_GT_OQ>(d, _mm256_setzero_pd());
+                bits = _mm256_or_pd(bits, _mm256_and_pd(is_forward, self.bits_of(1 << axis)));
+            }
+            let [x, y, z] = size;
+            let is_y = _mm256_cmp_pd::<_CMP_GT_OQ>(y, z);
+            let is_x = _mm256_cmp_pd::<_CMP_GT_OQ>(x, z);
+            let x_or_z = _mm256_andnot_pd(is_x, self.bits_of(2 * 8));
+            let y_or_z = _mm256_blendv_pd(self.bits_of(2 * 8), self.bits_of(8), is_y);
+            let axis = _mm256_blendv_pd(y_or_z, x_or_z, _mm256_cmp_pd::<_CMP_GT_OQ>(x, y));
+            let most = _mm256_set1_pd(NEAR_FRAME * NEAR_FRAME);
+            let is_near = _mm256_cmp_pd::<_CMP_LE_OQ>(distance, most);
+            let class = _mm256_or_pd(axis, bits);
+            let is_in = _mm256_and_pd(is_plain, is_near);
+            let class = _mm256_blendv_pd(self.bits_of(CLASSES as u64), class, is_in);
+            _mm256_storeu_si256(classes.as_mut_ptr().cast(), _mm256_castpd_si256(class));
+        }
+        classes
+    }
+
+    #[inline(always)]
+    fn fill(self, group: &mut RayGroup, rays: [&Ray; LANES], turn: &Turn) {
+        let [a, b, c, d, e, f, g, h] = rays;
+        // SAFETY: a value of this type says that the CPU has AVX2. The stores write arrays of
+        // exactly 8 numbers, those of f64 by halves.
+        unsafe {
+            let halves = [self.numbers_of([a, b, c, d]), self.numbers_of([e, f, g, h])];
+            let one = _mm256_set1_pd(1.0);
+            for axis in 0..3 {
+                let low = self.turned(halves[0][axis], axis, &turn.frame);
+                let high = self.turned(halves[1][axis], axis, &turn.frame);
+                let [below, above] = self.rounded_outward(low, high);
+                let forward = turn.is_forward[axis];
+                let (near, far) = if forward { (above, below) } else { (below, above) };
+                _mm256_store_ps(group.near_origin[axis].as_mut_ptr(), near);
+                _mm256_store_ps(group.far_origin[axis].as_mut_ptr(), far);
+                let low = _mm256_cvtpd_ps(_mm256_div_pd(one, halves[0][3 + axis]));
+                let high = _mm256_cvtpd_ps(_mm256_div_pd(one, halves[1][3 + axis]));
+                let inverse = _mm256_set_m128(high, low);
+                _mm256_store_ps(group.inverse[axis].as_mut_ptr(), inverse);
+                let far_inverse = _mm256_mul_ps(inverse, _mm256_set1_ps(FAR));
+                _mm256_store_ps(group.far_inverse[axis].as_mut_ptr(), far_inverse);
+            }
+            let [x, y, z] = turn.axes;
+            let mut reach = [one; 2];
+            for (half, numbers) in halves.iter().enumerate() {
+                let store = |lanes: &mut [f64; LANES], numbers| {
+                    _mm256_store_pd(lanes.as_mut_ptr().add(4 * half), numbers);
+                };
+                let depth = numbers[3 + z];
+                store(&mut group.origin[0], numbers[x]);
+                store(&mut group.origin[1], numbers[y]);
+                store(&mut group.origin[2], numbers[z]);
+                store(&mut group.slopes[0], _mm256_div_pd(numbers[3 + x], depth));
+                store(&mut group.slopes[1], _mm256_div_pd(numbers[3 + y], depth));
+                store(&mut group.slopes[2], _mm256_div_pd(one, depth));
+                let turn = &turn.reach;
+                let from_start = _mm256_sub_pd(numbers[6], _mm256_set1_pd(turn.start));
+                let scaled = _mm256_mul_pd(from_start, _mm256_set1_pd(turn.scale));
+                let plain = _mm256_add_pd(scaled, _mm256_set1_pd(turn.slack));
+                let size = _mm256_andnot_pd(_mm256_set1_pd(-0.0), plain);
+                let slack = _mm256_mul_pd(size, _mm256_set1_pd(NEAR));
+                reach[half] = _mm256_add_pd(plain, slack);
+            }
+            let [_, above] = self.rounded_outward(reach[0], reach[1]);
+            _mm256_store_ps(group.high.as_mut_ptr(), above);
+        }
+    }
+
+    #[inline(always)]
     fn enter(self, groups: &[RayGroup; GROUPS], [near, far]: [[f32; 3]; 2], mask: u64) -> u64 {
         let mut met = 0;
         // SAFETY: a value of this type says that the CPU has AVX2. The loads read arrays of
@@ -130,11 +223,11 @@ impl BoxKernel for Avx2Boxes {
             let splat =
                 |x: [f32; 3]| [_mm256_set1_ps(x[0]), _mm256_set1_ps(x[1]), _mm256_set1_ps(x[2])];
             let (near, far) = (splat(near), splat(far));
-            for (k, group) in groups.iter().enumerate() {
-                let asking = mask >> (LANES * k) & 0xFF;
-                if asking == 0 {
-                    continue;
-                }
+            let mut left = mask;
+            while left != 0 {
+                let k = left.trailing_zeros() as usize / LANES % GROUPS;
+                let (group, asking) = (&groups[k], left >> (LANES * k) & 0xFF);
+                left &= !(0xFF << (LANES * k));
                 let mut enter = _mm256_set1_ps(-0.0);
                 let mut leave = _mm256_load_ps(group.high.as_ptr());
                 for axis in 0..3 {
@@ -190,11 +283,11 @@ impl BoxKernel for Avx2Boxes {
     ) -> Crossings {
         let mut crossings = Crossings::default();
         // Half a group at a time.
-        for half in 0..2 * GROUPS {
-            let asking = mask >> (4 * half) & 0xF;
-            if asking == 0 {
-                continue;
-            }
+        let mut left = mask;
+        while left != 0 {
+            let half = left.trailing_zeros() as usize / 4 % (2 * GROUPS);
+            let asking = left >> (4 * half) & 0xF;
+            left &= !(0xF << (4 * half));
             let (group, first) = (&groups[half / 2], 4 * (half % 2));
             // SAFETY: a value of this type says that the CPU has AVX2. The loads and the store
             // take 4 of 8 numbers, from the first or from the fifth on.
@@ -250,5 +343,79 @@ impl BoxKernel for Avx2Boxes {
             crossings.certain |= certain << (4 * half);
         }
         crossings
+    }
+}
+
+#[expect(clippy::unused_self, reason = "a value says that the CPU has the instructions")]
+impl Avx2Boxes {
+    /// The numbers of four rays side by side: starts, directions, reaches, and bits that mean no
+    /// number.
+    #[inline(always)]
+    fn numbers_of(self, rays: [&Ray; 4]) -> [__m256d; 8] {
+        // SAFETY: a value of this type says that the CPU has AVX2. A ray is 64 bytes without
+        // padding, and any bytes are a number.
+        unsafe {
+            let mut numbers = [_mm256_setzero_pd(); 8];
+            for half in [0, 4] {
+                let load =
+                    |ray: &Ray| _mm256_loadu_pd(std::ptr::from_ref(ray).cast::<f64>().add(half));
+                let [a, b, c, d] = [load(rays[0]), load(rays[1]), load(rays[2]), load(rays[3])];
+                let (even, odd) = (_mm256_unpacklo_pd(a, b), _mm256_unpackhi_pd(a, b));
+                let (later_even, later_odd) = (_mm256_unpacklo_pd(c, d), _mm256_unpackhi_pd(c, d));
+                numbers[half] = _mm256_permute2f128_pd::<0x20>(even, later_even);
+                numbers[half + 1] = _mm256_permute2f128_pd::<0x20>(odd, later_odd);
+                numbers[half + 2] = _mm256_permute2f128_pd::<0x31>(even, later_even);
+                numbers[half + 3] = _mm256_permute2f128_pd::<0x31>(odd, later_odd);
+            }
+            numbers
+        }
+    }
+
+    /// Coordinates on an axis in the frame of the boxes.
+    #[inline(always)]
+    fn turned(self, coordinates: __m256d, axis: usize, frame: &Frame) -> __m256d {
+        // SAFETY: a value of this type says that the CPU has AVX2.
+        unsafe {
+            let relative = _mm256_sub_pd(coordinates, _mm256_set1_pd(frame.origin[axis]));
+            _mm256_mul_pd(relative, _mm256_set1_pd(frame.scale))
+        }
+    }
+
+    /// The bits of a whole number in each lane.
+    #[inline(always)]
+    fn bits_of(self, value: u64) -> __m256d {
+        // SAFETY: a value of this type says that the CPU has AVX2.
+        unsafe { _mm256_castsi256_pd(_mm256_set1_epi64x(value.cast_signed())) }
+    }
+
+    /// Eight numbers in two halves as `below` and as `above` round them.
+    #[inline(always)]
+    fn rounded_outward(self, low: __m256d, high: __m256d) -> [__m256; 2] {
+        // SAFETY: a value of this type says that the CPU has AVX2.
+        unsafe {
+            let rounded = _mm256_set_m128(_mm256_cvtpd_ps(high), _mm256_cvtpd_ps(low));
+            let low_back = _mm256_cvtps_pd(_mm256_castps256_ps128(rounded));
+            let high_back = _mm256_cvtps_pd(_mm256_extractf128_ps::<1>(rounded));
+            // Answers of 64 bits to 32 bits each.
+            let narrow = |low, high| {
+                let pairs =
+                    _mm256_shuffle_ps::<0x88>(_mm256_castpd_ps(low), _mm256_castpd_ps(high));
+                _mm256_permute4x64_epi64::<0xD8>(_mm256_castps_si256(pairs))
+            };
+            let is_above = narrow(
+                _mm256_cmp_pd::<_CMP_GT_OQ>(low_back, low),
+                _mm256_cmp_pd::<_CMP_GT_OQ>(high_back, high),
+            );
+            let is_below = narrow(
+                _mm256_cmp_pd::<_CMP_LT_OQ>(low_back, low),
+                _mm256_cmp_pd::<_CMP_LT_OQ>(high_back, high),
+            );
+            let bits = _mm256_castps_si256(rounded);
+            // The step to the next number up: of a negative one the bits count down.
+            let step = _mm256_or_si256(_mm256_srai_epi32::<31>(bits), _mm256_set1_epi32(1));
+            let down = _mm256_sub_epi32(bits, _mm256_and_si256(is_above, step));
+            let up = _mm256_add_epi32(bits, _mm256_and_si256(is_below, step));
+            [_mm256_castsi256_ps(down), _mm256_castsi256_ps(up)]
+        }
     }
 }

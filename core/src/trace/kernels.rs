@@ -1,6 +1,6 @@
 //! The choice of the kernel that an instruction set has.
 
-use super::boxes::{KernelWork, ScalarBoxes};
+use super::boxes::{BoxKernel, KernelWork, ScalarBoxes};
 #[cfg(target_arch = "x86_64")]
 use super::boxes_x86::{Avx2Boxes, Sse2Boxes};
 use crate::isa::Isa;
@@ -19,6 +19,25 @@ pub(super) fn run_with_kernel<Input>(isa: Isa, input: &Input, work: &mut impl Ke
     }
 }
 
+/// Work on numbers side by side, in plain Rust, that is compiled once for each instruction set.
+pub(crate) trait LaneWork {
+    fn run(&mut self);
+}
+
+struct WithAnyKernel<'a, W>(&'a mut W);
+
+impl<W: LaneWork> KernelWork<()> for WithAnyKernel<'_, W> {
+    #[inline(always)]
+    fn run(&mut self, (): &(), _kernel: impl BoxKernel) {
+        self.0.run();
+    }
+}
+
+/// Does work with an instruction set, which this CPU must have.
+pub(crate) fn run_in_lanes(isa: Isa, work: &mut impl LaneWork) {
+    run_with_kernel(isa, &(), &mut WithAnyKernel(work));
+}
+
 #[cfg(test)]
 mod tests {
     use glam::DVec3;
@@ -31,9 +50,10 @@ mod tests {
             record::Surface,
         },
         trace::{
-            boxes::{BoxKernel, BoxRay},
-            lanes::{Crossings, MOST_RAYS},
-            packet::{Class, Packet},
+            box_ray::BoxRay,
+            boxes::BoxKernel,
+            lanes::{CLASSES, Crossings, LANES, MOST_RAYS, RayGroup, class_of},
+            packet::Packet,
             ray::{Ray, Shear},
             triangle::hit_triangle,
         },
@@ -122,6 +142,8 @@ mod tests {
     /// shared starts, so that edges, corners and planes are met.
     struct Group {
         frame: Frame,
+        /// Rays of all classes.
+        all: Vec<Ray>,
         rays: Vec<Ray>,
         packet: Packet,
         corners: [[f64; 3]; 3],
@@ -150,18 +172,19 @@ mod tests {
                 let direction = if direction.is_finite() { direction } else { DVec3::Y };
                 rays.push(Ray { origin, direction, reach, leaving, after });
             }
-            let class = Class::of(&rays[0], &frame);
-            rays.retain(|ray| class.is_some() && Class::of(ray, &frame) == class);
+            let all = rays.clone();
+            let class = class_of(&rays[0], &frame);
+            rays.retain(|ray| class < CLASSES as u64 && class_of(ray, &frame) == class);
             let mut packet = Packet::new();
             if !rays.is_empty() {
                 let members: Vec<u16> = (0..rays.len() as u16).collect();
-                packet.fill(&frame, &rays, &members);
+                packet.fill(ScalarBoxes, &frame, &rays, &members);
             }
-            let [x, y, z] = packet.axes;
+            let [x, y, z] = packet.turn.axes;
             let corners = corners.map(|corner| [corner[x], corner[y], corner[z]]);
             let node = random_node(random);
             let mask = random.bits() & packet.alive;
-            Self { frame, rays, packet, corners, node, mask }
+            Self { frame, all, rays, packet, corners, node, mask }
         }
 
         fn planes(&self, child: usize) -> [[f32; 3]; 2] {
@@ -179,6 +202,8 @@ mod tests {
         nears: [u32; 8],
         crossings: Crossings,
         distances: Vec<Option<u64>>,
+        classes: Vec<u64>,
+        filled: Option<String>,
     }
 
     impl KernelWork<Group> for Option<FoundByGroup> {
@@ -195,7 +220,16 @@ mod tests {
                 .map(|(k, t)| (crossings.certain >> k & 1 == 1).then_some(t.to_bits()))
                 .collect();
             let nears = nears.map(f32::to_bits);
-            *self = Some(FoundByGroup { entering, met, nears, crossings, distances });
+            let classes = group.all.as_chunks().0.iter();
+            let classes =
+                classes.flat_map(|four| kernel.classify(four.each_ref(), &group.frame)).collect();
+            let filled = group.rays.first_chunk().map(|rays: &[Ray; LANES]| {
+                let mut filled = RayGroup::EMPTY;
+                kernel.fill(&mut filled, rays.each_ref(), &packet.turn);
+                format!("{filled:?}")
+            });
+            *self =
+                Some(FoundByGroup { entering, met, nears, crossings, distances, classes, filled });
         }
     }
 
@@ -226,7 +260,7 @@ mod tests {
                     assert!(!enters || found.met >> child & 1 == 1, "{ray:?}");
                     entered += u32::from(enters);
                 }
-                let [x, y, z] = group.packet.axes;
+                let [x, y, z] = group.packet.turn.axes;
                 let corners = group.corners.map(|corner| {
                     let mut plain = [0.0; 3];
                     (plain[x], plain[y], plain[z]) = (corner[0], corner[1], corner[2]);

@@ -1,7 +1,20 @@
 //! Rays side by side, a lane each, and the tests that several of them take at once.
 
-use super::ray::{Shear, edge};
-use crate::prepared::node::Node;
+use super::{
+    box_ray::{BoxRay, FAR, NEAR_FRAME},
+    ray::{Ray, Shear, depth_axis, edge},
+};
+use crate::{
+    exact::float::{above, below},
+    prepared::node::{Frame, Node},
+};
+
+/// Rays of one class have the signs of their direction in common, and its largest component. Classes
+/// are numbered from 0 up to this, which is the class of a ray that can be in no packet.
+pub(super) const CLASSES: usize = 3 * 8;
+
+/// A direction's component of this size lets the ray move along the axis.
+pub(super) const LEAST_COMPONENT: f64 = 1e-30;
 
 /// Rays that are tested at once.
 pub(super) const LANES: usize = 8;
@@ -36,6 +49,31 @@ impl RayGroup {
         origin: [[0.0; LANES]; 3],
         slopes: [[0.0; LANES]; 3],
     };
+}
+
+/// How rays of one class become those of a [`RayGroup`].
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Turn {
+    /// The frame of the boxes.
+    pub(super) frame: Frame,
+    /// How distances are turned into that frame.
+    pub(super) reach: BoxRay,
+    /// On which axes the rays go forward.
+    pub(super) is_forward: [bool; 3],
+    /// The axes of each [`Shear`].
+    pub(super) axes: [usize; 3],
+}
+
+impl Turn {
+    /// The turn of rays of the class of `ray`, which is in a class.
+    pub(super) fn new(ray: &Ray, frame: &Frame) -> Self {
+        Self {
+            frame: *frame,
+            reach: BoxRay::near_frame(frame),
+            is_forward: ray.direction.to_array().map(|d| d > 0.0),
+            axes: Shear::new(ray.origin, ray.direction).axes,
+        }
+    }
 }
 
 /// Intervals that hold what the rays of some groups have.
@@ -98,6 +136,46 @@ fn by_groups(mask: u64, mut test: impl FnMut(usize) -> u64) -> u64 {
         }
     }
     met
+}
+
+/// The class of a ray: [`CLASSES`] for one that along some axis as good as stands still, or starts
+/// nowhere or far from the frame.
+#[inline(always)]
+pub(super) fn class_of(ray: &Ray, frame: &Frame) -> u64 {
+    let [o, d] = [ray.origin.to_array(), ray.direction.to_array()];
+    let mut class = 8 * depth_axis(d) as u64;
+    let mut distance = 0.0;
+    let mut is_plain = true;
+    for axis in 0..3 {
+        let relative = (o[axis] - frame.origin[axis]) * frame.scale;
+        distance += relative * relative;
+        is_plain &= d[axis].abs() >= LEAST_COMPONENT;
+        class |= u64::from(d[axis] > 0.0) << axis;
+    }
+    if is_plain && distance <= NEAR_FRAME * NEAR_FRAME { class } else { CLASSES as u64 }
+}
+
+/// `BoxKernel::fill` in plain Rust.
+#[inline(always)]
+pub(super) fn fill(group: &mut RayGroup, rays: [&Ray; LANES], turn: &Turn) {
+    for (lane, ray) in rays.into_iter().enumerate() {
+        for axis in 0..3 {
+            let relative = (ray.origin[axis] - turn.frame.origin[axis]) * turn.frame.scale;
+            let (low, high) = (below(relative), above(relative));
+            let (near, far) = if turn.is_forward[axis] { (high, low) } else { (low, high) };
+            group.near_origin[axis][lane] = near;
+            group.far_origin[axis][lane] = far;
+            let inverse = (1.0 / ray.direction[axis]) as f32;
+            group.inverse[axis][lane] = inverse;
+            group.far_inverse[axis][lane] = inverse * FAR;
+            group.origin[axis][lane] = ray.origin[turn.axes[axis]];
+        }
+        let [x, y, z] = turn.axes.map(|axis| ray.direction[axis]);
+        group.slopes[0][lane] = x / z;
+        group.slopes[1][lane] = y / z;
+        group.slopes[2][lane] = 1.0 / z;
+        group.high[lane] = turn.reach.reach(ray.reach);
+    }
 }
 
 /// `BoxKernel::enter` in plain Rust.

@@ -1,13 +1,14 @@
 //! Rays through a prepared scene: what they meet.
 
 pub(crate) mod batch;
+mod box_ray;
 mod boxes;
 #[cfg(target_arch = "x86_64")]
 #[expect(unsafe_code, reason = "SIMD intrinsics")]
 mod boxes_x86;
 mod course;
 mod hit;
-mod kernels;
+pub(crate) mod kernels;
 mod lanes;
 mod packet;
 mod parallelepiped;

@@ -10,54 +10,20 @@
 //! on the Intel MIC Architecture" (2012).
 
 use super::{
-    boxes::{BoxKernel, BoxRay, FAR, NEAR_FRAME},
-    lanes::{Beam, GROUPS, LANES, MOST_RAYS, RayGroup, larger, shear_at, smaller},
-    ray::{Ray, Shear, depth_axis},
+    box_ray::{BoxRay, FAR},
+    boxes::BoxKernel,
+    lanes::{Beam, GROUPS, LANES, MOST_RAYS, RayGroup, Turn, larger, shear_at, smaller},
+    ray::{Ray, Shear},
     traversal::{STACK, Stack, Step, visit_from},
 };
-use crate::{
-    exact::float::{above, below},
-    prepared::{
-        layout::View,
-        node::{Child, Frame},
-        record::{Item, Kind},
-    },
+use crate::prepared::{
+    layout::View,
+    node::{Child, Frame},
+    record::{Item, Kind},
 };
 
 /// So many rays, or fewer, go on alone.
 const FEW: u32 = 2;
-
-/// What rays of a packet have in common: the signs of their direction, and its largest component.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct Class(u8);
-
-impl Class {
-    /// Classes are numbered from 0 up to this.
-    pub(super) const COUNT: usize = 3 * 8;
-
-    /// The class of a ray; `None` for one that can be in no packet: along some axis it as good as
-    /// stands still, or it starts nowhere or far from the frame.
-    #[inline(always)]
-    pub(super) fn of(ray: &Ray, frame: &Frame) -> Option<Self> {
-        let [o, d] = [ray.origin.to_array(), ray.direction.to_array()];
-        let mut class = 8 * depth_axis(d) as u8;
-        let mut distance = 0.0;
-        let mut is_plain = true;
-        for axis in 0..3 {
-            let relative = (o[axis] - frame.origin[axis]) * frame.scale;
-            distance += relative * relative;
-            is_plain &= d[axis].abs() >= 1e-30;
-            class |= u8::from(d[axis] > 0.0) << axis;
-        }
-        (is_plain && distance <= NEAR_FRAME * NEAR_FRAME).then_some(Self(class))
-    }
-
-    /// The class as a number.
-    #[inline(always)]
-    pub(super) fn index(self) -> usize {
-        usize::from(self.0)
-    }
-}
 
 /// Up to [`MOST_RAYS`] rays of one class.
 pub(super) struct Packet {
@@ -65,10 +31,7 @@ pub(super) struct Packet {
     pub(super) beam: Beam,
     /// Where the rays cross a triangle.
     pub(super) crossings: [[f64; LANES]; GROUPS],
-    /// How distances are turned into the boxes' frame.
-    turn: BoxRay,
-    /// The axes of each [`Shear`].
-    pub(super) axes: [usize; 3],
+    pub(super) turn: Turn,
     /// The rays that still look for something, a bit each.
     pub(super) alive: u64,
 }
@@ -79,6 +42,14 @@ pub(super) struct PacketStack([(f32, Child, u64); STACK]);
 impl Default for PacketStack {
     fn default() -> Self {
         Self([(0.0, Child::NONE, 0); STACK])
+    }
+}
+
+/// Keeps the greater number of each lane.
+#[inline(always)]
+fn take_most(most: &mut [f32; LANES], lanes: &[f32; LANES]) {
+    for (most, &x) in most.iter_mut().zip(lanes) {
+        *most = larger(x, *most);
     }
 }
 
@@ -95,9 +66,7 @@ impl Span {
         for (least, &x) in least.iter_mut().zip(lanes) {
             *least = smaller(x, *least);
         }
-        for (most, &x) in most.iter_mut().zip(lanes) {
-            *most = larger(x, *most);
-        }
+        take_most(most, lanes);
     }
 
     #[inline(always)]
@@ -123,84 +92,55 @@ impl Packet {
             groups: [RayGroup::EMPTY; GROUPS],
             beam: Beam::EMPTY,
             crossings: [[0.0; LANES]; GROUPS],
-            turn: BoxRay::NOWHERE,
-            axes: [0; 3],
+            turn: Turn {
+                frame: Frame { origin: [0.0; 3], scale: 1.0 },
+                reach: BoxRay::NOWHERE,
+                is_forward: [false; 3],
+                axes: [0; 3],
+            },
             alive: 0,
         }
     }
 
-    /// Takes in the `members` of `rays`, which are of one class: at least one. Every number is that of
-    /// [`BoxRay::new`] and [`Shear::new`].
+    /// Takes in the `members` of `rays`, which are of one class: at least one.
     #[inline(always)]
-    pub(super) fn fill(&mut self, frame: &Frame, rays: &[Ray], members: &[u16]) {
-        let first = rays[usize::from(members[0])];
-        let [x, y, z] = Shear::new(first.origin, first.direction).axes;
-        self.axes = [x, y, z];
+    pub(super) fn fill(
+        &mut self,
+        kernel: impl BoxKernel,
+        frame: &Frame,
+        rays: &[Ray],
+        members: &[u16],
+    ) {
         self.alive = u64::MAX >> (MOST_RAYS - members.len());
-        self.turn = BoxRay::near_frame(frame);
-        let mut spans = [[Span::NONE; 4]; 3];
-        self.beam.high = f32::NEG_INFINITY;
-        for axis in 0..3 {
-            (self.beam.near[axis], self.beam.far[axis]) =
-                if first.direction[axis] > 0.0 { (axis, axis + 3) } else { (axis + 3, axis) };
-        }
-        // Where a start is on an axis, as near and as far planes want it.
-        let in_frame = |o: f64, axis: usize| {
-            let relative = (o - frame.origin[axis]) * frame.scale;
-            let (low, high) = (below(relative), above(relative));
-            if first.direction[axis] > 0.0 { (high, low) } else { (low, high) }
-        };
-        let is_same = |&member: &u16| rays[usize::from(member)].origin == first.origin;
-        let has_one_start = members.iter().all(is_same);
+        self.turn = Turn::new(&rays[usize::from(members[0])], frame);
+        let mut spans = [[Span::NONE; 3]; 3];
+        let mut most = [f32::NEG_INFINITY; LANES];
         for (group, members) in self.groups.iter_mut().zip(members.chunks(LANES)) {
-            let (mut origin, mut direction) = ([[0.0; LANES]; 3], [[0.0; LANES]; 3]);
             // Lanes without a ray have the last one.
-            let last = members[members.len() - 1];
-            let all = members.iter().chain(std::iter::repeat(&last));
-            for ((lane, high), &member) in group.high.iter_mut().enumerate().zip(all) {
-                let ray = &rays[usize::from(member)];
-                for axis in 0..3 {
-                    origin[axis][lane] = ray.origin[axis];
-                    direction[axis][lane] = ray.direction[axis];
-                }
-                *high = self.turn.reach(ray.reach);
-                self.beam.high = larger(*high, self.beam.high);
+            let last = members.len() - 1;
+            let mut of_lanes = [&rays[usize::from(members[last])]; LANES];
+            for (of_lane, &member) in of_lanes.iter_mut().zip(members) {
+                *of_lane = &rays[usize::from(member)];
             }
-            for axis in 0..3 {
-                if has_one_start {
-                    let (near, far) = in_frame(first.origin[axis], axis);
-                    group.near_origin[axis] = [near; LANES];
-                    group.far_origin[axis] = [far; LANES];
-                } else {
-                    for (lane, &o) in origin[axis].iter().enumerate() {
-                        (group.near_origin[axis][lane], group.far_origin[axis][lane]) =
-                            in_frame(o, axis);
-                    }
-                }
-                for (lane, d) in direction[axis].iter().enumerate() {
-                    let inverse = (1.0 / d) as f32;
-                    group.inverse[axis][lane] = inverse;
-                    group.far_inverse[axis][lane] = inverse * FAR;
-                }
-                spans[axis][0].take(&group.near_origin[axis]);
-                spans[axis][1].take(&group.far_origin[axis]);
-                spans[axis][2].take(&group.inverse[axis]);
-                spans[axis][3].take(&group.far_inverse[axis]);
+            kernel.fill(group, of_lanes, &self.turn);
+            for (axis, spans) in spans.iter_mut().enumerate() {
+                spans[0].take(&group.near_origin[axis]);
+                spans[1].take(&group.far_origin[axis]);
+                spans[2].take(&group.inverse[axis]);
             }
-            group.origin = [origin[x], origin[y], origin[z]];
-            for (lane, d) in direction[z].iter().enumerate() {
-                group.slopes[0][lane] = direction[x][lane] / d;
-                group.slopes[1][lane] = direction[y][lane] / d;
-                group.slopes[2][lane] = 1.0 / d;
-            }
+            take_most(&mut most, &group.high);
         }
+        self.beam.high = most.into_iter().fold(f32::NEG_INFINITY, larger);
         for (axis, spans) in spans.iter().enumerate() {
-            let [near_origin, far_origin, inverse, far_inverse] = spans;
-            let forward = usize::from(first.direction[axis] > 0.0);
-            self.beam.near_origin[axis] = near_origin.ends()[forward];
-            self.beam.far_origin[axis] = far_origin.ends()[1 - forward];
+            let forward = self.turn.is_forward[axis];
+            (self.beam.near[axis], self.beam.far[axis]) =
+                if forward { (axis, axis + 3) } else { (axis + 3, axis) };
+            let [near_origin, far_origin, inverse] = spans;
+            self.beam.near_origin[axis] = near_origin.ends()[usize::from(forward)];
+            self.beam.far_origin[axis] = far_origin.ends()[usize::from(!forward)];
             self.beam.inverse[axis] = inverse.ends();
-            self.beam.far_inverse[axis] = far_inverse.ends();
+            // Rounding keeps order.
+            self.beam.far_inverse[axis] = self.beam.inverse[axis].map(|inverse| inverse * FAR);
         }
     }
 
@@ -208,7 +148,7 @@ impl Packet {
     #[inline(always)]
     fn box_ray(&self, place: usize) -> BoxRay {
         let (group, lane) = (&self.groups[place / LANES], place % LANES);
-        let mut ray = self.turn;
+        let mut ray = self.turn.reach;
         (ray.near, ray.far) = (self.beam.near, self.beam.far);
         for axis in 0..3 {
             ray.near_origin[axis] = group.near_origin[axis][lane];
@@ -223,7 +163,7 @@ impl Packet {
     /// A ray as flat faces want it.
     #[inline(always)]
     fn shear(&self, place: usize) -> Shear {
-        shear_at(&self.groups[place / LANES], place % LANES, self.axes)
+        shear_at(&self.groups[place / LANES], place % LANES, self.turn.axes)
     }
 
     /// Notes what an item has meant for a ray; whether it ended or reaches less far.
@@ -232,7 +172,7 @@ impl Packet {
         match *step {
             Step::Past => return false,
             Step::On(reach) => {
-                self.groups[place / LANES].high[place % LANES] = self.turn.reach(reach);
+                self.groups[place / LANES].high[place % LANES] = self.turn.reach.reach(reach);
             }
             Step::Enough => self.alive &= !(1 << place),
         }
@@ -245,9 +185,7 @@ impl Packet {
         let mut most = [f32::NEG_INFINITY; LANES];
         for (k, group) in self.groups.iter().enumerate() {
             if self.alive >> (LANES * k) & 0xFF != 0 {
-                for (most, &high) in most.iter_mut().zip(&group.high) {
-                    *most = larger(high, *most);
-                }
+                take_most(&mut most, &group.high);
             }
         }
         self.beam.high = most.into_iter().fold(f32::NEG_INFINITY, larger);
@@ -279,7 +217,7 @@ impl Packet {
                     continue;
                 }
             };
-            let [x, y, z] = self.axes;
+            let [x, y, z] = self.turn.axes;
             let mut corners = [[0.0; 3]; 3];
             for (corner, vertex) in corners.iter_mut().zip(view.corners(vertices)) {
                 *corner = [vertex[x], vertex[y], vertex[z]];

@@ -1,5 +1,7 @@
 //! Rays, and what they hit.
 
+use std::mem::offset_of;
+
 use glam::DVec3;
 
 use crate::{
@@ -12,6 +14,7 @@ use crate::{
 
 /// A half-line, with what it must not meet.
 #[derive(Debug, Clone, Copy)]
+#[repr(C)]
 pub(crate) struct Ray {
     /// Where it starts.
     pub(crate) origin: DVec3,
@@ -26,9 +29,22 @@ pub(crate) struct Ray {
     pub(crate) after: u32,
 }
 
+// Kernels load a ray as eight numbers.
+const _: () = assert!(size_of::<Ray>() == 64 && offset_of!(Ray, direction) == 24);
+const _: () = assert!(offset_of!(Ray, reach) == 48 && offset_of!(Ray, leaving) == 56);
+
 impl Ray {
     /// No face comes later than this.
     pub(crate) const NOTHING_AHEAD: u32 = u32::MAX;
+
+    /// A ray that meets nothing.
+    pub(crate) const NOWHERE: Self = Self {
+        origin: DVec3::NAN,
+        direction: DVec3::NAN,
+        reach: 0.0,
+        leaving: Surface::NONE,
+        after: Self::NOTHING_AHEAD,
+    };
 }
 
 /// The nearest face along a ray: the smallest (t, rank).
