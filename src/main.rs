@@ -107,6 +107,7 @@ async fn run(command: Command, console: &Console) -> Result<(), Failure> {
         Command::Enable(StationArgs { worker, farm }) => {
             queue::run(farm, Wish::Station(worker, Standing::Active), &stop).await
         }
+        Command::Certs(args) => coordinator::make_certificates(&args),
         Command::Tokens(args) => coordinator::change_tokens(&args),
         Command::Report(args) => report::run(args, console, &stop).await,
         Command::Check(args) => check::run(args, console, &stop).await,
