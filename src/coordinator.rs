@@ -62,6 +62,7 @@ pub(crate) async fn run(
         },
         upload_silence: args.upload_seconds,
         events: args.events.clone(),
+        begins_coarsely: false,
         host: Some(args.name.clone().unwrap_or_else(own_name)),
         scene_folder: folder.clone(),
         picture_folder: folder,

@@ -69,8 +69,11 @@ impl Role {
 
     /// Says whether who has this role may call that method, by its path.
     fn may(self, path: &str) -> bool {
-        let Some((service, method)) = path.trim_start_matches('/').split_once('/') else {
-            return false;
+        let path = path.trim_start_matches('/');
+        let (service, method) = match path.split_once('/') {
+            Some(named) => named,
+            None if path == "metrics" => ("page", path),
+            None => return false,
         };
         let reads = matches!(method, "List" | "Workers" | "Watch" | "Image" | "Explain");
         match (self, service) {
