@@ -1,7 +1,7 @@
 //! The command line's words.
 
 use std::{
-    fmt, fs, ops::RangeInclusive, os::unix::fs::PermissionsExt, path::PathBuf, str::FromStr,
+    fmt, fs, ops::RangeInclusive, os::unix::fs::MetadataExt, path::PathBuf, str::FromStr,
     time::Duration,
 };
 
@@ -106,6 +106,8 @@ pub(crate) enum Command {
     Disable(StationArgs),
     /// Give tiles again to a worker that was disabled or is drained.
     Enable(StationArgs),
+    /// Make the certificates, tokens and access files of a farm before its coordinator is started.
+    Certs(CertsArgs),
     /// Renew or revoke a token of a farm; its coordinator need not be stopped.
     Tokens(TokensArgs),
     /// Say whether a picture is what its scene gives: tiles of it are rendered again and compared.
@@ -159,6 +161,21 @@ pub(crate) struct CheckArgs {
     /// Answer in JSON.
     #[arg(long, help_heading = TALK)]
     pub(crate) json: bool,
+}
+
+#[derive(Debug, ClapArgs)]
+pub(crate) struct CertsArgs {
+    /// The folder of the farm's state, which is made if there is none; DIR/access has all.
+    #[arg(long, value_name = "DIR", env = "RTFARM_STATE")]
+    pub(crate) state: PathBuf,
+
+    /// Where others will find the coordinator.
+    #[arg(long, value_name = "HOST", env = "RTFARM_NAME")]
+    pub(crate) name: String,
+
+    /// The port that it will listen on.
+    #[arg(long, value_name = "PORT", default_value = "7878")]
+    pub(crate) port: u16,
 }
 
 #[derive(Debug, ClapArgs)]
@@ -592,7 +609,10 @@ impl AccessArgs {
             );
         };
         let read = || -> anyhow::Result<Access> {
-            let for_others = fs::metadata(path)?.permissions().mode() & 0o077;
+            let metadata = fs::metadata(path)?;
+            // Who gave another's file for this user to read knows what they do: a Kubernetes secret is so.
+            let is_own = metadata.uid() == rustix::process::geteuid().as_raw();
+            let for_others = metadata.mode() & if is_own { 0o077 } else { 0o007 };
             ensure!(for_others == 0, "others may read it; chmod 600 makes it yours alone");
             Ok(Access::read(&fs::read_to_string(path)?)?)
         };

@@ -111,6 +111,7 @@ async fn run(command: Command, console: &Console) -> Result<(), Failure> {
         Command::Enable(StationArgs { worker, farm }) => {
             queue::run(farm, Wish::Station(worker, Standing::Active), &stop).await
         }
+        Command::Certs(args) => coordinator::make_certificates(&args),
         Command::Tokens(args) => coordinator::change_tokens(&args),
         Command::Report(args) => report::run(args, console, &stop).await,
         Command::Verify(args) => verify::run(args, &stop).await,
