@@ -241,7 +241,10 @@ fn explain(job: u64, tile: u32, told: &wire::ExplainResponse) -> Answer {
         _ => "open",
     };
     let tally = told.tally.unwrap_or_default();
-    let hash: String = told.hash.iter().map(|byte| format!("{byte:02x}")).collect();
+    let hash = told.hash.iter().fold(String::new(), |mut hex, byte| {
+        let _ = write!(hex, "{byte:02x}");
+        hex
+    });
     let is_known = !hash.is_empty();
     let attempts = told.attempts.iter().map(|attempt| {
         json!({
