@@ -24,7 +24,7 @@ use tokio_util::sync::CancellationToken;
 
 use crate::{
     BUILD, VERSION,
-    args::{CoordinatorArgs, TokenChange, TokensArgs},
+    args::{CertsArgs, CoordinatorArgs, TokenChange, TokensArgs},
     failure::Failure,
     output::folder_of,
     private_folder::PrivateFolder,
@@ -61,13 +61,20 @@ pub(crate) async fn run(
             byte_count: u64::from(args.keep_gb) * 1_000_000_000,
         },
         upload_silence: args.upload_seconds,
+        events: args.events.clone(),
+        begins_coarsely: false,
+        host: Some(args.name.clone().unwrap_or_else(own_name)),
         scene_folder: folder.clone(),
         picture_folder: folder,
     };
     let coordinator = match state {
-        Some(state) => Coordinator::with_state(config, state)?,
-        None => Coordinator::new(config)?,
+        Some(state) => Coordinator::with_state(config, state),
+        None => Coordinator::new(config),
     };
+    let coordinator = coordinator.with_context(|| match &args.events {
+        Some(path) => format!("cannot start with events in {}", path.display()),
+        None => "cannot start".to_owned(),
+    })?;
     coordinator.run(listener, stop.cancelled()).await?;
     if terminate.is_cancelled() { Ok(()) } else { Err(Failure::Interrupted) }
 }
@@ -134,9 +141,7 @@ impl Place {
         };
         let host = match &args.name {
             Some(name) => name.clone(),
-            None if address.ip().is_unspecified() => {
-                rustix::system::uname().nodename().to_string_lossy().into_owned()
-            }
+            None if address.ip().is_unspecified() => own_name(),
             None if address.is_ipv6() => format!("[{}]", address.ip()),
             None => address.ip().to_string(),
         };
@@ -145,6 +150,23 @@ impl Place {
         tracing::info!(folder = %state.join("access").display(), "access files are there");
         Ok((Listener::Tls(listener, security, args.limits()), shown))
     }
+}
+
+/// What this machine calls itself.
+fn own_name() -> String {
+    rustix::system::uname().nodename().to_string_lossy().into_owned()
+}
+
+/// `rtfarm certs`.
+pub(crate) fn make_certificates(args: &CertsArgs) -> Result<(), Failure> {
+    let CertsArgs { state, name, port } = args;
+    let address = format!("https://{name}:{port}").parse().map_err(anyhow::Error::from);
+    let address = address.map_err(Failure::Input)?;
+    fs::create_dir_all(state).with_context(|| format!("cannot make {}", state.display()))?;
+    Security::open(state, &address).map_err(anyhow::Error::from)?;
+    writeln!(io::stdout().lock(), "{}", state.join("access").display())
+        .context("cannot write to standard output")?;
+    Ok(())
 }
 
 /// `rtfarm tokens`.

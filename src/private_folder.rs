@@ -12,6 +12,7 @@ use anyhow::Context;
 use rustix::{
     fs::{FlockOperation, flock},
     process::geteuid,
+    system::uname,
 };
 use tempfile::TempDir;
 
@@ -31,10 +32,21 @@ pub(crate) struct PrivateFolder {
 impl PrivateFolder {
     /// Makes one in `parent`, and removes those there whose processes are gone.
     pub(crate) fn new(parent: &Path) -> anyhow::Result<Self> {
-        remove_orphans(parent);
+        Self::with_prefix(parent, PREFIX)
+    }
+
+    /// Makes one on a disk that machines share. Some disks do not show a lock to other machines, so that
+    /// each removes only what its own processes left.
+    pub(crate) fn new_for_many(parent: &Path) -> anyhow::Result<Self> {
+        let host = uname().nodename().to_string_lossy().into_owned();
+        Self::with_prefix(parent, &format!("rtfarm@{host}@"))
+    }
+
+    fn with_prefix(parent: &Path, prefix: &str) -> anyhow::Result<Self> {
+        remove_orphans(parent, prefix);
         let make = || -> io::Result<Self> {
             let folder = tempfile::Builder::new()
-                .prefix(PREFIX)
+                .prefix(prefix)
                 .permissions(fs::Permissions::from_mode(0o700))
                 .tempdir_in(parent)?;
             // Nobody sees the file before it is locked.
@@ -54,10 +66,10 @@ impl PrivateFolder {
 
 /// Removes this user's folders of processes that are gone. What cannot be removed stays: it is in
 /// nobody's way.
-fn remove_orphans(parent: &Path) {
+fn remove_orphans(parent: &Path, prefix: &str) {
     let Ok(entries) = fs::read_dir(parent) else { return };
     for entry in entries.flatten() {
-        if !entry.file_name().as_encoded_bytes().starts_with(PREFIX.as_bytes()) {
+        if !entry.file_name().as_encoded_bytes().starts_with(prefix.as_bytes()) {
             continue;
         }
         let path = entry.path();

@@ -1,8 +1,8 @@
-//! `rtfarm render`: a picture from this machine alone.
+//! `rtfarm render`: a picture by this machine alone, or by a cluster's nodes.
 
 use std::{
     collections::VecDeque,
-    io::{self, Write},
+    io::{self, Seek, Write},
     sync::{Arc, Mutex},
     time::Duration,
 };
@@ -10,15 +10,21 @@ use std::{
 use anyhow::{Context, anyhow};
 use rtfarm_coordinator::{Config, Coordinator, Job, Keeping, Listener};
 use rtfarm_core::{
+    isa::Isa,
     language::{Style, draw_diagnostics},
     render::{DEEPEST, Sampling, Tally},
     tile::Size,
     transfer::Transfer,
 };
-use rtfarm_job::{Order, Outcome, Progress, Refusal};
-use rtfarm_picture::{Canvas, Picture};
+use rtfarm_job::{Order, Outcome, Progress, Provenance, Refusal};
+use rtfarm_picture::{Canvas, Notes};
 use rtfarm_proto::Address;
-use tokio::{net::UnixListener, sync::watch, task::spawn_blocking, time::Instant};
+use tokio::{
+    net::UnixListener,
+    sync::watch,
+    task::spawn_blocking,
+    time::{Instant, sleep},
+};
 use tokio_util::sync::CancellationToken;
 
 use crate::{
@@ -35,8 +41,12 @@ use crate::{
     private_folder::PrivateFolder,
     resume::{Begun, Resume},
     scene_files::SceneFiles,
+    show, slurm,
     source::SceneText,
 };
+
+/// So long those who watch a picture on its page see that it is finished.
+const LAST_LOOK: Duration = Duration::from_millis(700);
 
 /// What there is to say about a finished render.
 #[derive(Debug)]
@@ -142,17 +152,27 @@ struct Rendered {
 }
 
 enum Drawn {
-    Here(Canvas),
+    Here(Canvas, Provenance),
     Job(Arc<Job>),
 }
 
 impl Drawn {
-    fn picture(&self) -> &Picture {
+    /// Writes the picture's file.
+    fn encode(&self, out: impl Write + Seek) -> io::Result<()> {
         match self {
-            Self::Here(canvas) => canvas.picture(),
-            Self::Job(job) => job.picture(),
+            Self::Here(canvas, provenance) => {
+                let provenance = provenance.text(&canvas.tally()?);
+                let software = format!("rtfarm {}", software());
+                canvas.picture().encode(&Notes { software, provenance }, out)
+            }
+            Self::Job(job) => job.picture().encode(&job.notes(&software())?, out),
         }
     }
+}
+
+/// This program's version and build.
+pub(crate) fn software() -> String {
+    format!("{VERSION} ({BUILD})")
 }
 
 /// The command under way.
@@ -175,6 +195,11 @@ pub(crate) async fn run(
     stop: &CancellationToken,
 ) -> Result<(), Failure> {
     let started = Instant::now();
+    if args.show && args.workers_and_threads().0 == 0 {
+        return Err(Failure::Input(anyhow!(
+            "--show is a coordinator's, and with --workers 0 there is none"
+        )));
+    }
     let pictures = match args.frames {
         Some(frames) => frames.pictures(&args.picture).map_err(Failure::Input)?,
         None => vec![args.picture.clone()],
@@ -188,7 +213,7 @@ pub(crate) async fn run(
     let mut render = Render { args: &args, console, stop, coordinator: None, told: started.into() };
     let first = render.place_next(&mut wanted).await?.expect("there is one at least");
     match args.workers_and_threads() {
-        (0, _) => {
+        (0, _) if args.slurm.is_none() => {
             let (last, end) = render.all_but_the_last(first, wanted).await?;
             render.write(last).await?;
             end
@@ -267,19 +292,30 @@ impl Render<'_> {
     /// Waits until a picture is rendered.
     async fn render(&self, started: Started) -> Result<Rendered, Failure> {
         let Started { size, sampling, transfer, output, resume, work } = started;
+        let mut workers = self.args.workers_and_threads().0;
         let (picture, tally, rendering) = match work {
             Work::Here(ordered) => {
                 let (order, begun) = *ordered;
+                let provenance = Provenance {
+                    build: software(),
+                    scene: order.prepared.hash(),
+                    settings: order.settings,
+                    grid: order.grid,
+                    transfer: order.transfer,
+                    format: order.format,
+                };
                 let (canvas, tally, rendering) = self.render_here(order, begun).await?;
-                (Drawn::Here(canvas), tally, rendering)
+                (Drawn::Here(canvas, provenance), tally, rendering)
             }
             Work::Job(job) => {
                 let rendering = wait(&job, self.console).await?;
-                let tally = job.progress().borrow().tally;
+                let Progress { tally, worker_count, .. } = *job.progress().borrow();
+                if self.args.slurm.is_some() {
+                    workers = worker_count as usize;
+                }
                 (Drawn::Job(job), tally, rendering)
             }
         };
-        let workers = self.args.workers_and_threads().0;
         let summary = Summary { size, tally, sampling, transfer, rendering, workers };
         Ok(Rendered { summary, output, resume, picture })
     }
@@ -288,11 +324,15 @@ impl Render<'_> {
     async fn write(&self, rendered: Rendered) -> Result<(), Failure> {
         let Rendered { summary, output, resume, picture } = rendered;
         let job = match &picture {
-            Drawn::Here(_) => None,
+            Drawn::Here(..) => None,
             Drawn::Job(job) => Some(job.id()),
         };
         write_picture(&output, self.stop, picture).await?;
         if let (Some(coordinator), Some(job)) = (&self.coordinator, job) {
+            if self.args.show {
+                // Who watches sees the end.
+                sleep(LAST_LOOK).await;
+            }
             coordinator.cancel(job);
         }
         if let Some(resume) = resume {
@@ -345,47 +385,69 @@ impl Render<'_> {
         Ok((canvas, tally, rendering))
     }
 
-    /// Renders all pictures by local workers.
+    /// Renders all pictures by workers.
     async fn with_workers(
         &mut self,
         (workers, threads): (usize, usize),
         first: Frame,
         wanted: Wanted,
     ) -> Result<(), Failure> {
+        let args = self.args;
         let folder = PrivateFolder::new(&std::env::temp_dir())?;
         let socket = folder.path().join("socket");
-        let listener = UnixListener::bind(&socket)
-            .with_context(|| format!("cannot listen on {}", socket.display()))?;
+        let (listener, slurm) = if let Some(options) = args.slurm.clone() {
+            let (host, patience) = (args.slurm_host(), args.patience);
+            let shared = first.output.folder();
+            let ordering =
+                spawn_blocking(move || slurm::Order::new(&shared, options, host, patience));
+            let (order, listener) = ordering.await??;
+            (listener, Some(order))
+        } else {
+            let listener = UnixListener::bind(&socket)
+                .with_context(|| format!("cannot listen on {}", socket.display()))?;
+            (Listener::Unix(listener), None)
+        };
+        let is_here = slurm.is_none();
         let coordinator = Coordinator::new(Config {
             version: VERSION.to_owned(),
             build: BUILD.to_owned(),
-            // The workers are this very program on this machine: nobody here has a reason to lie.
-            reference: None,
-            term: self.args.lease_seconds,
-            audit: 0.0,
+            // Local workers are this very program on this machine: nobody here has a reason to lie.
+            reference: (!is_here).then(|| rtfarm_worker::reference(Isa::fastest())),
+            term: args.lease_seconds,
+            audit: if is_here { 0.0 } else { AUDIT },
             keeping: Keeping::default(),
             upload_silence: UPLOAD_SILENCE,
+            events: None,
+            begins_coarsely: self.args.show,
+            host: None,
             scene_folder: folder.path().to_owned(),
             picture_folder: first.output.folder(),
         })?;
         self.coordinator = Some(coordinator.clone());
+        if self.args.show {
+            show::show(&coordinator, folder.path(), self.console).await?;
+        }
         let stop_serving = CancellationToken::new();
         let serving = tokio::spawn({
             let (coordinator, stop) = (coordinator.clone(), stop_serving.clone());
-            async move { coordinator.run(Listener::Unix(listener), stop.cancelled()).await }
+            async move { coordinator.run(listener, stop.cancelled()).await }
         });
-        let setup = Setup {
-            coordinator: Address::Unix(socket),
-            threads,
-            isa: self.args.isa.0,
-            log_format: self.args.log_format,
+        let mut crew = if let Some(order) = slurm {
+            Crew::Slurm(order.submit().await?)
+        } else {
+            let setup = Setup {
+                coordinator: Address::Unix(socket),
+                threads,
+                isa: args.isa.0,
+                log_format: args.log_format,
+            };
+            let children = Children::start(workers, setup, self.console);
+            Crew::Local(children.context("cannot start workers")?)
         };
-        let mut children =
-            Children::start(workers, setup, self.console).context("cannot start workers")?;
 
         let rendered = tokio::select! {
             rendered = self.all_but_the_last(first, wanted) => rendered,
-            reason = children.keep_up(&coordinator, self.args.patience) => {
+            reason = crew.keep_up(&coordinator, args.patience) => {
                 Err(Failure::Other(anyhow!(reason)))
             }
             () = self.stop.cancelled() => Err(Failure::Interrupted),
@@ -393,18 +455,53 @@ impl Render<'_> {
         coordinator.close();
         let end = match rendered {
             Ok((last, end)) => {
-                let (written, ()) = tokio::join!(self.write(last), children.go_home(&coordinator));
+                let (written, ()) = tokio::join!(self.write(last), crew.go_home(&coordinator));
                 written.and(end)
             }
             Err(failure) => {
                 coordinator.cancel_all();
-                children.end(&coordinator).await;
+                crew.end(&coordinator).await;
                 Err(failure)
             }
         };
         stop_serving.cancel();
         serving.await??;
         end
+    }
+}
+
+/// How much of what workers on other machines render is rendered again; see `coordinator --audit`.
+const AUDIT: f64 = 0.01;
+
+/// Those who render.
+enum Crew {
+    Local(Children),
+    Slurm(slurm::Array),
+}
+
+impl Crew {
+    /// Returns when nobody is left to render, with what to say of it.
+    async fn keep_up(&mut self, coordinator: &Coordinator, patience: Duration) -> String {
+        match self {
+            Self::Local(children) => children.keep_up(coordinator, patience).await,
+            Self::Slurm(array) => array.keep_up().await,
+        }
+    }
+
+    /// Waits for them to go home, then ends those that do not.
+    async fn go_home(&mut self, coordinator: &Coordinator) {
+        match self {
+            Self::Local(children) => children.go_home(coordinator).await,
+            Self::Slurm(array) => array.end().await,
+        }
+    }
+
+    /// Ends them now.
+    async fn end(&mut self, coordinator: &Coordinator) {
+        match self {
+            Self::Local(children) => children.end(coordinator).await,
+            Self::Slurm(array) => array.end().await,
+        }
     }
 }
 
@@ -535,7 +632,7 @@ async fn write_picture(
     drawn: Drawn,
 ) -> Result<(), Failure> {
     let (output, token) = (output.clone(), stop.clone());
-    let written = spawn_blocking(move || output.write(&token, |file| drawn.picture().encode(file)));
+    let written = spawn_blocking(move || output.write(&token, |file| drawn.encode(file)));
     match written.await? {
         Err(_) if stop.is_cancelled() => Err(Failure::Interrupted),
         written => Ok(written?),

@@ -3,16 +3,26 @@
 //! A block ```` ```rt NAME ```` is saved as a file, ```` ```rt + NAME ```` added to one. Lines of a
 //! ```` ```console ```` block that begin with `$ ` are run, one after the other, in the page's own
 //! folder; the lines below one must be among what it says, in that order, whatever the numbers. A
-//! comment `# exit code N` at a command's end says how it ends, otherwise it is well.
+//! comment `# exit code N` at a command's end says how it ends, otherwise it is well. One that ends with
+//! `&` runs until the page ends; the next waits until it has said its lines. A ```` ```slurm ```` block is
+//! one for a cluster, whose `SLURM_CONF` the environment must name:
+//!
+//!     tests/slurm-cluster start /tmp/cluster
+//!     SLURM_CONF=/tmp/cluster/slurm.conf cargo test --test pages
+//!     tests/slurm-cluster stop /tmp/cluster
 
 use std::{
     env,
     fmt::Write as _,
-    fs::{self, OpenOptions},
+    fs::{self, File, OpenOptions},
     io::Write as _,
     path::Path,
-    process::Command,
+    process::{Child, Command, Stdio},
+    thread,
+    time::Duration,
 };
+
+use rustix::process::{Pid, Signal, kill_process};
 
 /// A command of a page, and what the page says comes of it.
 struct Shown<'a> {
@@ -70,6 +80,28 @@ fn without_numbers(line: &str) -> String {
     told
 }
 
+/// What runs in the background while a page is tried.
+struct Background(Vec<Child>);
+
+impl Drop for Background {
+    fn drop(&mut self) {
+        // Workers go before their coordinator.
+        for child in self.0.iter_mut().rev() {
+            let _ = kill_process(Pid::from_child(child), Signal::TERM);
+            let _ = child.wait();
+        }
+    }
+}
+
+/// Which of the lines that a page shows is not among what was said; `None` when all are.
+fn unsaid<'a>(said: &str, lines: &[&'a str]) -> Option<&'a str> {
+    let mut told = said.lines().map(without_numbers);
+    lines.iter().copied().find(|line| {
+        let wanted = without_numbers(line);
+        !told.any(|line| line.ends_with(&wanted))
+    })
+}
+
 /// What is wrong with a page, if anything is.
 fn try_page(page: &str) -> Result<usize, String> {
     let folder = tempfile::tempdir().unwrap();
@@ -78,7 +110,9 @@ fn try_page(page: &str) -> Result<usize, String> {
         [program.to_owned()].into_iter().chain(env::split_paths(&env::var_os("PATH").unwrap())),
     )
     .unwrap();
-    let mut count = 0;
+    let deploy = Path::new(env!("CARGO_MANIFEST_DIR")).join("deploy");
+    std::os::unix::fs::symlink(deploy, folder.path().join("deploy")).unwrap();
+    let (mut count, mut background) = (0, Background(Vec::new()));
     for (kind, lines) in blocks(page) {
         if let Some(name) = kind.strip_prefix("rt ") {
             let (name, adds) = name.strip_prefix("+ ").map_or((name, false), |name| (name, true));
@@ -91,29 +125,41 @@ fn try_page(page: &str) -> Result<usize, String> {
             for line in lines {
                 writeln!(file, "{line}").unwrap();
             }
-        } else if kind == "console" {
+        } else if kind == "console" || kind == "slurm" && env::var_os("SLURM_CONF").is_some() {
             for Shown { command, exit_code, lines } in shown(&lines) {
-                let output = Command::new("sh")
-                    .args(["-c", &format!("exec 2>&1; {command}")])
+                let log = folder.path().join(format!("log{count}"));
+                let said = || fs::read_to_string(&log).unwrap();
+                let mut shell = Command::new("sh");
+                shell
                     .current_dir(folder.path())
                     .env("PATH", &path)
+                    // Of other farms on this machine nothing is known.
+                    .env("RTFARM_LISTEN", "127.0.0.1:0")
                     .env_remove("RUST_LOG")
-                    .output()
-                    .unwrap();
-                let said = String::from_utf8_lossy(&output.stdout);
-                let mut told = said.lines().map(without_numbers);
-                let mut wrong = String::new();
-                if output.status.code() != Some(exit_code) {
-                    writeln!(wrong, "it ended with {}", output.status).unwrap();
+                    .stdin(Stdio::null())
+                    .stdout(File::create(&log).unwrap());
+                if kind == "slurm" {
+                    // Its nodes find each other by their names.
+                    shell.env("RTFARM_LISTEN", "0.0.0.0:0").env("RTFARM_SLURM_HOST", "127.0.0.1");
                 }
-                for line in lines {
-                    let wanted = without_numbers(line);
-                    if !told.any(|line| line == wanted) {
-                        writeln!(wrong, "it did not say: {line}").unwrap();
+                let (wrong, said) = if let Some(command) = command.strip_suffix(" &") {
+                    let command = format!("exec 2>&1; exec {command}");
+                    background.0.push(shell.args(["-c", &command]).spawn().unwrap());
+                    let mut waits = 0;
+                    while unsaid(&said(), &lines).is_some() && waits < 500 {
+                        thread::sleep(Duration::from_millis(20));
+                        waits += 1;
                     }
-                }
-                if !wrong.is_empty() {
-                    return Err(format!("$ {command}\n{wrong}it said:\n{said}"));
+                    (None, said())
+                } else {
+                    let status = shell.args(["-c", &format!("exec 2>&1; {command}")]).status();
+                    let status = status.unwrap();
+                    let is_wrong = status.code() != Some(exit_code);
+                    (is_wrong.then(|| format!("it ended with {status}")), said())
+                };
+                let missing = unsaid(&said, &lines).map(|line| format!("it did not say: {line}"));
+                if let Some(wrong) = wrong.or(missing) {
+                    return Err(format!("$ {command}\n{wrong}\nit said:\n{said}"));
                 }
                 count += 1;
             }
@@ -136,7 +182,7 @@ fn what_the_pages_say_happens() {
         }
     }
     assert!(wrong.is_empty(), "{wrong}");
-    assert!(commands >= 14, "{commands} commands");
+    assert!(commands >= 22, "{commands} commands");
 }
 
 #[test]

@@ -70,6 +70,8 @@ pub struct JobState {
     pub differing_tiles: u32,
     /// Why the job does not get further, unless that may change by itself; otherwise empty.
     pub obstacle: String,
+    /// How long it will take yet and one standard deviation of that, if it can be told.
+    pub left: Option<[Duration; 2]>,
     /// How it ended, when it has.
     pub end: Option<JobEnd>,
 }
@@ -427,11 +429,7 @@ impl Submission {
 
     /// Event: somebody wants this client to end.
     pub(crate) fn on_stop(&mut self, now: Instant) {
-        match self.stage {
-            // What was reached is told, and the farm is already being told to forget the job.
-            Stage::Cancelling { .. } => {}
-            _ => self.give_up(NoPicture::Interrupted, now),
-        }
+        self.give_up(NoPicture::Interrupted, now);
     }
 
     fn enter(&mut self, stage: Stage, action: Action, deadline: Instant) {
@@ -450,6 +448,7 @@ impl Submission {
             | Stage::Reconnecting { job: Some((job, _)), .. } => {
                 self.cancel(job, Err(failure), now);
             }
+            // What was reached is told, and the farm is already being told to forget the job.
             Stage::Cancelling { .. } | Stage::Ended => {}
         }
     }
@@ -508,6 +507,7 @@ mod tests {
             worker_count: 2,
             differing_tiles: 0,
             obstacle,
+            left: None,
             end,
         }
     }
@@ -694,6 +694,7 @@ mod tests {
             bench.check_actions(&["Connect"]);
             bench.submission.on_connected(bench.now);
             bench.check_actions(&["Watch(JobId(7))"]);
+            assert_eq!(bench.submission.deadline, Some(bench.now + DEADLINE));
             bench.submission.on_trouble(lost(), bench.now);
             assert_eq!(bench.sleep(), FIRST_PAUSE * 4);
             bench.submission.on_connected(bench.now);

@@ -8,7 +8,7 @@ use std::{
 };
 
 use rtfarm_core::{render::Tally, tile::TileId};
-use rtfarm_job::{Outcome, Progress};
+use rtfarm_job::{Outcome, Progress, TileCosts};
 use rtfarm_proto::{Incarnation, JobId, LONGEST_WAIT, LeaseId, LeaseName, Renewal, WorkerId};
 
 use crate::{
@@ -84,8 +84,12 @@ struct JobState {
     /// Tiles of which such pixels came: who brought the last, under which lease.
     senseless: BTreeMap<TileId, (WorkerId, LeaseId)>,
     storing: BTreeMap<TileId, Storing>,
-    /// What the tiles in the picture took that came since this start, in the order of coming.
-    tallies: Vec<(TileId, Tally)>,
+    /// The tiles in the picture that came since this start, in the order of coming.
+    brought: Vec<Delivery>,
+    /// The leases that were given since this start, the earliest first.
+    history: Vec<Given>,
+    /// What the tiles that were brought took.
+    costs: TileCosts,
     /// Tiles of which copies differ, and nobody could say which is right.
     unsettled: BTreeSet<TileId>,
 }
@@ -258,17 +262,21 @@ impl JobState {
             suspects: BTreeSet::new(),
             senseless: BTreeMap::new(),
             storing: BTreeMap::new(),
-            tallies: Vec::new(),
+            brought: Vec::new(),
+            history: Vec::new(),
+            costs: TileCosts::default(),
             unsettled: BTreeSet::new(),
         }
     }
 
     /// Counts no more what tiles took that are out of the picture again.
     fn forget_tallies(&mut self, taken: &BTreeSet<TileId>) {
-        self.tallies.retain(|(tile, _)| !taken.contains(tile));
+        self.brought.retain(|delivery| !taken.contains(&delivery.tile));
         self.progress.tally = self.earlier.tally;
-        for (_, tally) in &self.tallies {
-            self.progress.tally.add(tally);
+        self.costs = TileCosts::default();
+        for delivery in &self.brought {
+            self.costs.add(delivery.seconds);
+            self.progress.tally.add(&delivery.tally);
         }
     }
 
@@ -436,6 +444,7 @@ impl Farm {
     ) {
         for loss in losses {
             let job = loss.lease.job;
+            self.note_lost(&loss, reason);
             for &tile in &loss.again {
                 if self.audit.on_loss(job, tile) {
                     actions.push(Action::Log(Notice::NotCompared(job, tile)));
@@ -489,7 +498,9 @@ impl Farm {
         let grid = self.leases.tiles(job)?.grid();
         let tiles: Vec<TileId> = numbers.iter().filter_map(|&number| grid.tile(number)).collect();
         let threads = self.members.threads(worker).0;
-        self.leases.on_offer((worker, threads), job, &tiles, now)
+        let run = self.leases.on_offer((worker, threads), job, &tiles, now)?;
+        self.note_given(worker, &run, now);
+        Some(run)
     }
 
     /// Event: nobody waits for the answer to a question any longer.
@@ -517,6 +528,7 @@ impl Farm {
                 }
             };
             let run = run.expect("the job has a free tile, or the lease one that is in no other");
+            self.note_given(ask.worker, &run, now);
             actions.push(Action::Answer(id, Ok(Next::Render(run))));
         }
         while let Some((from, id, quiet)) = self.next_second_rendering()
@@ -525,6 +537,7 @@ impl Farm {
         {
             let run = self.leases.on_idle_at_the_end(ask.worker, quiet, now);
             let run = run.expect("a quiet lease holds a tile that no other lease holds");
+            self.note_given(ask.worker, &run, now);
             actions.push(Action::Answer(id, Ok(Next::Render(run))));
         }
         while let Some((until, id)) = self.waiting.next_deadline()
@@ -575,11 +588,10 @@ impl Farm {
     /// A lease of another worker whose next tile of `job` should have come long ago.
     fn overdue(&self, job: JobId, worker: WorkerId, now: Instant) -> Option<LeaseId> {
         let predicted = self.leases.pace(job)?.mean()?;
-        let mut quiet = self.leases.quietest().take_while(|quiet| quiet.from <= now);
-        let overdue = quiet.find(|quiet| {
-            let from = quiet.last_tile + LONGEST_QUIET + predicted * OVERDUE;
-            quiet.lease.job == job && quiet.worker != worker && from <= now
-        });
+        let mut quiet = self.leases.quietest(job);
+        let overdue = quiet
+            .find(|quiet| quiet.worker != worker)
+            .filter(|quiet| quiet.last_tile + LONGEST_QUIET + predicted * OVERDUE <= now);
         overdue.map(|quiet| quiet.lease.id)
     }
 
@@ -595,16 +607,20 @@ impl Farm {
     /// From when on which waiting question can be answered with a tile of which quiet lease.
     fn next_second_rendering(&self) -> Option<(Instant, AskId, LeaseId)> {
         self.waiting.first()?;
-        // With two that wait, the first lease will do; with one, all but its own.
-        self.leases.quietest().find_map(|quiet| {
-            let may = |worker| {
-                worker != quiet.worker
-                    && !self.leases.is_on_trial(worker)
-                    && self.may_begin(worker, quiet.lease.job)
-            };
-            let (ask, _) = self.waiting.iter().find(|(_, ask)| may(ask.worker))?;
-            Some((quiet.from, ask, quiet.lease.id))
-        })
+        // With two that wait, the first lease of a job will do; with one, all but its own.
+        let first_of = |job| {
+            self.leases.quietest(job).find_map(|quiet| {
+                let may = |worker| {
+                    worker != quiet.worker
+                        && !self.leases.is_on_trial(worker)
+                        && self.may_begin(worker, job)
+                };
+                let (ask, _) = self.waiting.iter().find(|(_, ask)| may(ask.worker))?;
+                Some((quiet.from, ask, quiet.lease.id))
+            })
+        };
+        let firsts = self.leases.quiet_jobs().filter_map(first_of);
+        firsts.min_by_key(|&(from, _, lease)| (from, lease))
     }
 
     // Rendering and stitching.
@@ -750,7 +766,10 @@ impl Farm {
         self.members.on_tile(worker);
         job.progress.tiles_done = done;
         job.progress.tally.add(&delivery.tally);
-        job.tallies.push((tile, delivery.tally));
+        job.brought.push(delivery);
+        job.costs.add(delivery.seconds);
+        let left = job.progress.tile_count - done;
+        job.progress.left = job.costs.time_left(left, now.saturating_duration_since(job.started));
         job.progress.worker_count = job.earlier.worker_count.max(job.contributors.len() as u32);
         let (progress, elapsed) = (job.progress.clone(), job.elapsed(now));
         let mut actions = vec![Action::Acknowledge(storing.id, Verdict::Accepted)];
@@ -957,7 +976,7 @@ impl Farm {
             }
             job.rest = Some(tiles);
         }
-        job.progress.outcome = Some(outcome);
+        (job.progress.outcome, job.progress.left) = (Some(outcome), None);
         actions.push(Action::Publish(id, job.progress.clone()));
         for storing in std::mem::take(&mut job.storing).into_values() {
             let copies = storing.copies.into_iter().map(|(id, _)| id);
@@ -1052,11 +1071,16 @@ impl Farm {
     }
 }
 
+mod history;
 mod queue;
 mod trust;
+mod watching;
 
+use history::Given;
+pub(crate) use history::{Attempt, Explanation};
 pub use queue::Keeping;
 pub(crate) use queue::{Change, JobEntry, Phase as JobPhase, Refused, Terms};
+pub(crate) use watching::Arrived;
 
 #[cfg(test)]
 mod tests;

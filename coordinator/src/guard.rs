@@ -9,10 +9,11 @@ use std::{
 };
 
 use tonic::{
+    Status,
     body::Body,
     codegen::{
         Service,
-        http::{HeaderValue, Request, Response, header::AUTHORIZATION},
+        http::{HeaderValue, Request, Response, Version, header::AUTHORIZATION},
     },
     server::NamedService,
 };
@@ -51,6 +52,11 @@ where
     }
 
     fn call(&mut self, request: Request<Body>) -> Answering {
+        if request.version() < Version::HTTP_2 {
+            // Pages from anywhere can have a browser say that, and nobody else does.
+            let status = Status::failed_precondition("gRPC is spoken in HTTP/2");
+            return Box::pin(ready(Ok(status.into_http())));
+        }
         if let Some(security) = &self.security {
             let path = request.uri().path();
             let shown = request.headers().get(AUTHORIZATION).map(HeaderValue::as_bytes);

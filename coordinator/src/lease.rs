@@ -5,6 +5,7 @@
 use std::{
     cmp::Reverse,
     collections::{BTreeMap, BTreeSet},
+    mem,
     time::{Duration, Instant},
 };
 
@@ -40,8 +41,8 @@ pub(crate) const LONGEST_QUIET: Duration = Duration::from_millis(400);
 
 /// The leases of all jobs that are being rendered, and those jobs. Invariants: a lease holds at
 /// least one tile, and those that it holds alone or shares are open; each lease has one entry in `expiries`, `by_worker`
-/// and `by_job`, and one in `quiet` exactly while it holds a tile alone that is under no
-/// suspicion; `with_free` has exactly the jobs with a free tile, `with_suspects` those with a free
+/// and `by_job`, and one in its job's set in `quiet` exactly while it holds a tile alone that is under no
+/// suspicion; no set there is empty; `with_free` has exactly the jobs with a free tile, `with_suspects` those with a free
 /// tile under suspicion.
 #[derive(Debug)]
 pub(crate) struct Leases {
@@ -54,7 +55,8 @@ pub(crate) struct Leases {
     with_suspects: BTreeSet<JobId>,
     held: BTreeMap<LeaseId, Lease>,
     expiries: BTreeSet<(Instant, LeaseId)>,
-    quiet: BTreeSet<(Instant, LeaseId)>,
+    /// By the last tile. (How long it may be silent depends on its job, and changes with each tile.)
+    quiet: BTreeMap<JobId, BTreeSet<(Instant, LeaseId)>>,
     by_worker: BTreeSet<(WorkerId, LeaseId)>,
     by_job: BTreeSet<(JobId, LeaseId)>,
 }
@@ -102,7 +104,7 @@ struct Lease {
     last_tile: Instant,
     /// Its entries in `expiries` and `quiet`.
     expires: Instant,
-    quiet_from: Option<Instant>,
+    quiet: Option<Instant>,
 }
 
 /// How far a tile is.
@@ -157,7 +159,7 @@ impl Leases {
             with_suspects: BTreeSet::new(),
             held: BTreeMap::new(),
             expiries: BTreeSet::new(),
-            quiet: BTreeSet::new(),
+            quiet: BTreeMap::new(),
             by_worker: BTreeSet::new(),
             by_job: BTreeSet::new(),
         }
@@ -178,11 +180,20 @@ impl Leases {
         self.expiries.first().map(|&(until, _)| until)
     }
 
-    /// Leases of which a tile may be rendered a second time, the quietest first.
-    pub(crate) fn quietest(&self) -> impl Iterator<Item = Quiet> {
-        self.quiet.iter().map(|&(from, id)| {
-            let Lease { worker, job, last_tile, .. } = self.held[&id];
-            Quiet { lease: LeaseName { job, id }, worker, from, last_tile }
+    /// The jobs of which a tile may be rendered a second time.
+    pub(crate) fn quiet_jobs(&self) -> impl Iterator<Item = JobId> {
+        self.quiet.keys().copied()
+    }
+
+    /// The leases of a job of which a tile may be rendered a second time, the quietest first.
+    pub(crate) fn quietest(&self, job: JobId) -> impl Iterator<Item = Quiet> {
+        let silence = self.pace(job).and_then(Pace::mean).map(|mean| mean * QUIET_TILES);
+        let silence = silence.map_or(LONGEST_QUIET, |it| it.clamp(SHORTEST_QUIET, LONGEST_QUIET));
+        self.quiet.get(&job).into_iter().flatten().map(move |&(last_tile, id)| Quiet {
+            lease: LeaseName { job, id },
+            worker: self.held[&id].worker,
+            from: last_tile + silence,
+            last_tile,
         })
     }
 
@@ -196,6 +207,18 @@ impl Leases {
     pub(crate) fn workers_of(&self, job: JobId) -> BTreeSet<WorkerId> {
         let of_job = (job, LeaseId(0))..=(job, LeaseId(u64::MAX));
         self.by_job.range(of_job).map(|(_, id)| self.held[id].worker).collect()
+    }
+
+    /// The tiles of a job that workers have and have not brought, and whether they are known to have
+    /// begun them.
+    pub(crate) fn in_work(&self, job: JobId) -> impl Iterator<Item = (TileId, WorkerId, bool)> {
+        let of_job = (job, LeaseId(0))..=(job, LeaseId(u64::MAX));
+        let leases = self.by_job.range(of_job).map(|(_, id)| &self.held[id]);
+        leases.flat_map(|lease| {
+            let tiles = &self.jobs[&lease.job].tiles;
+            let places = lease.alone.iter().chain(&lease.shared).chain(&lease.again);
+            places.map(|place| (tiles.tile(*place), lease.worker, lease.begun.contains_key(place)))
+        })
     }
 
     /// How many tiles a worker has.
@@ -372,7 +395,7 @@ impl Leases {
             work: 0,
             last_tile: now,
             expires: until,
-            quiet_from: None,
+            quiet: None,
         };
         self.expiries.insert((until, id));
         self.held.insert(id, lease);
@@ -392,17 +415,27 @@ impl Leases {
             self.expiries.insert((expires, id));
         }
 
-        let quiet_from = (!lease.alone.is_empty() && !lease.is_lone).then(|| {
-            let mean = self.jobs[&lease.job].pace.mean();
-            let silence = mean.map_or(LONGEST_QUIET, |mean| mean * QUIET_TILES);
-            lease.last_tile + silence.clamp(SHORTEST_QUIET, LONGEST_QUIET)
-        });
-        if lease.quiet_from != quiet_from {
-            if let Some(from) = lease.quiet_from {
-                self.quiet.remove(&(from, id));
-            }
-            self.quiet.extend(quiet_from.map(|from| (from, id)));
-            lease.quiet_from = quiet_from;
+        let quiet = (!lease.alone.is_empty() && !lease.is_lone).then_some(lease.last_tile);
+        if lease.quiet != quiet {
+            let (job, before) = (lease.job, mem::replace(&mut lease.quiet, quiet));
+            self.index_quiet((job, id), before, quiet);
+        }
+    }
+
+    /// Moves the entry of a lease in `quiet`.
+    fn index_quiet(
+        &mut self,
+        (job, id): (JobId, LeaseId),
+        before: Option<Instant>,
+        now: Option<Instant>,
+    ) {
+        let leases = self.quiet.entry(job).or_default();
+        if let Some(last_tile) = before {
+            leases.remove(&(last_tile, id));
+        }
+        leases.extend(now.map(|last_tile| (last_tile, id)));
+        if leases.is_empty() {
+            self.quiet.remove(&job);
         }
     }
 
@@ -659,9 +692,7 @@ impl Leases {
     fn remove(&mut self, id: LeaseId) -> Option<Lease> {
         let lease = self.held.remove(&id)?;
         self.expiries.remove(&(lease.expires, id));
-        if let Some(from) = lease.quiet_from {
-            self.quiet.remove(&(from, id));
-        }
+        self.index_quiet((lease.job, id), lease.quiet, None);
         self.by_worker.remove(&(lease.worker, id));
         self.by_job.remove(&(lease.job, id));
         Some(lease)
@@ -738,7 +769,12 @@ impl Leases {
             }
         }
         let quiet = leases().filter(|(_, lease)| !lease.alone.is_empty() && !lease.is_lone);
-        assert!(self.quiet == quiet.map(|(&id, lease)| (lease.quiet_from.unwrap(), id)).collect());
+        let mut by_job: BTreeMap<JobId, BTreeSet<_>> = BTreeMap::new();
+        for (&id, lease) in quiet {
+            assert_eq!(lease.quiet, Some(lease.last_tile));
+            by_job.entry(lease.job).or_default().insert((lease.last_tile, id));
+        }
+        assert!(self.quiet == by_job);
     }
 
     fn is_empty(&self) -> bool {
@@ -803,7 +839,7 @@ mod tests {
 
     /// From when on `worker` may render a tile of the quietest lease of others again.
     fn quiet_for(leases: &Leases, worker: WorkerId) -> Option<(Instant, LeaseId)> {
-        let mut others = leases.quietest().filter(|quiet| quiet.worker != worker);
+        let mut others = leases.quietest(JOB).filter(|quiet| quiet.worker != worker);
         others.next().map(|quiet| (quiet.from, quiet.lease.id))
     }
 
@@ -832,7 +868,7 @@ mod tests {
         let now = start + TERM / 2;
         deliver(&mut leases, A, 1, tiles[0], now);
         assert_eq!(leases.next_expiry(), Some(now + TERM));
-        assert_eq!(leases.quietest().next().unwrap().last_tile, now);
+        assert_eq!(leases.quietest(JOB).next().unwrap().last_tile, now);
     }
 
     #[test]

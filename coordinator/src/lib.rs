@@ -3,26 +3,31 @@
 //!
 //! `farm` and what it is made of decide: time is an argument there, and nothing waits. `shell` runs
 //! that machine: it hands events to it and does what it answers, with the files of `store` and what
-//! it keeps of each `job`. `service` translates between gRPC and the shell, and `run` serves. Each
+//! it keeps of each `job`. `service` translates between gRPC and the shell, `page` shows a browser what `live` tells, and
+//! `run` serves. Each
 //! knows only what stands before it:
 //!
 //! ```text
 //! identity, tiles, pace <- lease, members, waiting, audit <- farm, store, record <- state <- job
-//! job <- shell <- service <- run
-//! security, accept <- guard <- service; accept <- run
+//! farm <- events; events, job <- shell <- live, metrics <- page; shell <- service <- run
+//! security, accept <- guard, page <- service; accept <- run
 //! ```
 
 mod accept;
 mod audit;
+mod events;
 mod farm;
 mod guard;
 mod identity;
 mod job;
 mod lease;
+mod live;
 #[cfg(test)]
 mod load;
 mod members;
+mod metrics;
 mod pace;
+mod page;
 mod record;
 #[cfg(test)]
 mod restart;

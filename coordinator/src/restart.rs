@@ -77,10 +77,13 @@ impl Coordinator {
             keeping: Keeping::default(),
             term: Duration::from_secs(4),
             upload_silence: Duration::from_secs(4),
+            events: None,
+            begins_coarsely: false,
+            host: None,
             scene_folder: PathBuf::new(),
             picture_folder: PathBuf::new(),
         };
-        let shell = Shell::new(config, identity, [7; 32], Some(folder));
+        let shell = Shell::new(config, identity, [7; 32], Some(folder)).unwrap();
         let worker = shell.join(Process { nonce: 1, threads: 1, ..Process::default() }).unwrap();
         Ok(Self { shell, worker })
     }
@@ -126,7 +129,7 @@ impl Coordinator {
 
 fn encode(job: &Job) -> Vec<u8> {
     let mut out = Cursor::new(Vec::new());
-    job.picture().encode(&mut out).unwrap();
+    job.picture().encode(&rtfarm_picture::Notes::default(), &mut out).unwrap();
     out.into_inner()
 }
 

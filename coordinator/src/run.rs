@@ -71,7 +71,7 @@ impl Coordinator {
         if let Some(folder) = &folder {
             identity.farm = folder.farm();
         }
-        Ok(Self { shell: Arc::new(Shell::new(config, identity, secret, folder)) })
+        Ok(Self { shell: Arc::new(Shell::new(config, identity, secret, folder)?) })
     }
 
     /// Takes an order. This writes files: never call it on the async runtime.
@@ -112,6 +112,14 @@ impl Coordinator {
     /// Sends every worker home.
     pub fn close(&self) {
         self.shell.close();
+    }
+
+    /// Serves the page to those on this machine who have this token, until the coordinator stops.
+    pub async fn show(&self, listener: TcpListener, token: &str) -> Result<(), ServeError> {
+        let door = Door { is_local: false, limits: Limits::default(), places: None };
+        let router = service::page_router(&self.shell, token);
+        let stop = self.shell.stop.clone();
+        Ok(serve_accepted(router, accept_tcp(&listener), door, stop).await?)
     }
 
     /// Serves workers and clients until `shutdown` comes; returns when they have been sent home.

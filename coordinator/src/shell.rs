@@ -2,7 +2,7 @@
 //! Nothing is decided here.
 
 use std::{
-    collections::{BTreeMap, HashMap},
+    collections::{BTreeMap, BTreeSet, HashMap},
     future::pending,
     io,
     path::PathBuf,
@@ -14,7 +14,7 @@ use rtfarm_core::{
     prepared::SceneHash,
     tile::{TileGrid, TileId},
 };
-use rtfarm_job::{FinishedTile, Order, Progress};
+use rtfarm_job::{FinishedTile, Order, Outcome, Progress};
 use rtfarm_picture::{Canvas, CanvasTile, TileRecord};
 use rtfarm_proto::{Bytes, Incarnation, JobId, LeaseName, Renewal, WorkerId};
 use tokio::sync::{Notify, oneshot};
@@ -22,9 +22,10 @@ use tokio_util::sync::CancellationToken;
 
 use crate::{
     audit::Audit,
+    events::Events,
     farm::{
-        Action, Change, Delivery, DeliveryId, Earlier, Farm, JobEntry, Keeping, Next, Notice,
-        Refused, Terms, Verdict,
+        Action, Arrived, Change, Delivery, DeliveryId, Earlier, Explanation, Farm, JobEntry,
+        Keeping, Next, Notice, Refused, Terms, Verdict,
     },
     identity::{Identity, Stranger},
     job::Job,
@@ -54,8 +55,14 @@ pub struct Config {
     pub audit: f64,
     /// How long jobs that have ended are kept.
     pub keeping: Keeping,
+    /// A job that begins has a coarse picture rendered first, for those who watch.
+    pub begins_coarsely: bool,
+    /// The name by which others know this machine: the page is shown under no other.
+    pub host: Option<String>,
     /// A client that sends nothing of its scene for this long is given up.
     pub upload_silence: Duration,
+    /// Where what happens is told besides, if anywhere: a JSON object a line.
+    pub events: Option<PathBuf>,
     /// For prepared scenes: a folder that is nobody else's.
     pub scene_folder: PathBuf,
     /// For pictures while they are rendered.
@@ -102,6 +109,8 @@ pub(crate) struct Shell {
     changing: Mutex<()>,
     /// Told when the machine wants to be woken earlier than it will be.
     earlier: Notify,
+    /// What happened.
+    pub(crate) events: Events,
     /// Cancelled when everybody has gone home: connections are to be closed.
     pub(crate) stop: CancellationToken,
 }
@@ -111,6 +120,8 @@ struct State {
     farm: Farm,
     /// Jobs that the machine has not forgotten.
     jobs: BTreeMap<JobId, Arc<Job>>,
+    /// Those that render coarse pictures of what others do.
+    coarse: BTreeSet<JobId>,
     /// Questions that the machine has not answered.
     asks: HashMap<AskId, oneshot::Sender<Result<Next, NoMember>>>,
     /// What workers brought and the machine has not answered, by the number of its first tile.
@@ -181,7 +192,8 @@ impl Shell {
         identity: Identity,
         secret: [u8; 32],
         mut folder: Option<StateFolder>,
-    ) -> Self {
+    ) -> io::Result<Self> {
+        let events = Events::new(config.events.as_deref())?;
         let audit = Audit::new(config.audit, secret);
         let mut farm = match &folder {
             Some(folder) => Farm::keeping_jobs(identity, config.term, audit, folder.last_job()),
@@ -193,6 +205,7 @@ impl Shell {
         let state = State {
             farm,
             jobs: BTreeMap::new(),
+            coarse: BTreeSet::new(),
             asks: HashMap::new(),
             batches: BTreeMap::new(),
             last_number: 0,
@@ -207,12 +220,13 @@ impl Shell {
             state: Mutex::new(state),
             changing: Mutex::default(),
             earlier: Notify::new(),
+            events,
             stop: CancellationToken::new(),
         };
         for job in kept.into_iter().flatten() {
             shell.take_up(job);
         }
-        shell
+        Ok(shell)
     }
 
     fn state(&self) -> MutexGuard<'_, State> {
@@ -241,7 +255,15 @@ impl Shell {
             self.do_work(work);
         }
         for (job, progress) in works.progress.into_values() {
-            job.publish(progress);
+            let finished = match &progress.outcome {
+                Some(Outcome::Finished(time)) => Some(*time),
+                _ => None,
+            };
+            if job.publish(progress)
+                && let Some(time) = finished
+            {
+                self.events.on_finished(job.id, time);
+            }
         }
         value
     }
@@ -309,7 +331,10 @@ impl Shell {
 
     fn do_work(&self, work: Work) {
         match work {
-            Work::Log(notice) => log(*notice),
+            Work::Log(notice) => {
+                self.events.on_notice(&notice);
+                log(*notice);
+            }
             Work::Drop(job) => job.forget(),
             Work::Reopen(job) => job.reopen(),
             Work::Keep(job, terms) => job.keep(terms),
@@ -534,7 +559,7 @@ impl Shell {
         let same = same.as_ref().map(|job| job.scene.path());
         let kept = folder.create_job(id, (&ticket, &plan), &prepared, same);
         let (scene, canvas, folder) = kept.map_err(SubmitError::State)?;
-        let job = Job::new(id, ticket, &plan, scene, canvas, Some(folder));
+        let job = Job::new(id, ticket, &plan, scene, canvas, (Some(folder), false));
         self.begin(&job, Tiles::new(grid), Earlier::default(), false);
         Ok(job)
     }
@@ -577,10 +602,34 @@ impl Shell {
         drop(prepared);
         let (hash, scene_byte_count) = (scene.hash(), scene.byte_count());
         let plan = Plan { scene: hash, scene_byte_count, settings, grid, format, transfer };
-        let job = Job::new(id, ticket, &plan, scene, canvas, None);
+        let job = Job::new(id, ticket, &plan, scene, canvas, (None, false));
         let (tiles, earlier) = progress_of(grid, done);
+        if self.config.begins_coarsely && !tiles.is_over() {
+            self.coarse(&job);
+        }
         self.begin(&job, tiles, earlier, false);
         Ok(job)
+    }
+
+    /// The job of a coarse picture of what another job renders, before all others: it is made when
+    /// there is none. Nobody is told of it but those who watch. This writes a file: never call it on
+    /// the async runtime.
+    pub(crate) fn coarse(&self, of: &Arc<Job>) -> Option<Arc<Job>> {
+        let id = coarse_id(of.id);
+        if let Some(known) = self.job(id) {
+            return Some(known);
+        }
+        let plan = of.coarse()?;
+        let Plan { scene, scene_byte_count, grid, format, transfer, .. } = plan;
+        let canvas = Canvas::new_in(&self.config.picture_folder, grid, format, transfer).ok()?;
+        // The file is that of the other job.
+        let scene = SceneFile::kept(of.scene.path().to_owned(), scene, scene_byte_count);
+        let name = format!("{}, coarse", of.ticket.name);
+        let ticket = Ticket { name, priority: i32::MAX, ..Ticket::default() };
+        let job = Job::new(id, ticket, &plan, scene, canvas, (None, false));
+        self.state().coarse.insert(id);
+        self.begin(&job, Tiles::new(grid), Earlier::default(), false);
+        Some(job)
     }
 
     fn begin(&self, job: &Arc<Job>, tiles: Tiles, earlier: Earlier, is_paused: bool) {
@@ -596,6 +645,7 @@ impl Shell {
             done = (tiles.done_count() > 0).then_some(tiles.done_count()),
             "job started"
         );
+        self.events.on_job(job.id, &job.ticket.name);
         self.tell(|state, now| {
             state.jobs.insert(job.id, Arc::clone(job));
             let terms = terms_of(job, is_paused, false);
@@ -607,9 +657,11 @@ impl Shell {
     fn take_up(&self, kept: KeptJob) {
         let KeptJob { id, ticket, is_paused, is_foreign, plan, scene, canvas, done, end, folder } =
             kept;
-        let job = Job::new(id, ticket, &plan, scene, canvas, Some(folder));
+        let job = Job::new(id, ticket, &plan, scene, canvas, (Some(folder), is_foreign));
         if let Some((end, age)) = end {
             let terms = terms_of(&job, is_paused, is_foreign);
+            // Who watches is not told of its end as of news.
+            job.progress.send_replace(end.clone());
             self.tell(|state, now| {
                 state.jobs.insert(id, job);
                 ((), state.farm.on_kept(id, end, terms, (age, now)))
@@ -622,6 +674,9 @@ impl Shell {
 
     /// Ends and forgets a job; says whether it was known.
     pub(crate) fn cancel(&self, job: JobId) -> bool {
+        if self.state().coarse.remove(&coarse_id(job)) {
+            self.tell_farm(|farm, now| farm.on_cancel(coarse_id(job), now));
+        }
         self.tell(|state, now| (state.jobs.contains_key(&job), state.farm.on_cancel(job, now)))
     }
 
@@ -644,6 +699,9 @@ impl Shell {
         self.tell(|state, now| {
             let entries = state.farm.job_entries(now).into_iter();
             let known = |entry: JobEntry| {
+                if state.coarse.contains(&entry.id) {
+                    return None;
+                }
                 let job = state.jobs.get(&entry.id).cloned()?;
                 Some((entry, job))
             };
@@ -654,6 +712,31 @@ impl Shell {
     /// The workers, and how many tiles each has.
     pub(crate) fn workers(&self) -> Vec<(MemberEntry, usize)> {
         self.tell(|state, now| (state.farm.worker_entries(now), Vec::new()))
+    }
+
+    /// Which tiles came into a job's picture, but for the first `seen`.
+    pub(crate) fn arrived(&self, job: JobId, seen: usize) -> Option<Arrived> {
+        self.state().farm.arrived(job, seen)
+    }
+
+    /// Says of each tile of a job whether it is in the picture, if that is known.
+    pub(crate) fn done(&self, job: JobId) -> Option<Vec<bool>> {
+        self.state().farm.done(job)
+    }
+
+    /// The tiles of a job that workers have, and whether they are known to have begun them.
+    pub(crate) fn in_work(&self, job: JobId) -> Vec<(TileId, WorkerId, bool)> {
+        self.state().farm.in_work(job)
+    }
+
+    /// Says whether nobody is there to render.
+    pub(crate) fn lacks_workers(&self) -> bool {
+        self.state().farm.lacks_workers()
+    }
+
+    /// What became of a tile.
+    pub(crate) fn explain(&self, job: JobId, tile: TileId) -> Option<Explanation> {
+        self.tell(|state, now| (state.farm.explain(job, tile, now), Vec::new()))
     }
 
     /// Decides what a worker gets.
@@ -678,6 +761,11 @@ impl Shell {
     pub(crate) fn job_with_scene(&self, hash: SceneHash) -> Option<Arc<Job>> {
         self.state().jobs.values().find(|job| job.scene.hash() == hash).cloned()
     }
+}
+
+/// The number of the coarse picture of what a job renders; no other job comes to have it.
+fn coarse_id(of: JobId) -> JobId {
+    JobId(!of.0)
 }
 
 /// What the machine knows of a job besides its tiles.

@@ -321,7 +321,7 @@ fn a_worker_that_falsifies_five_percent_is_caught_and_leaves_no_trace_in_the_pic
 }
 
 /// How long one coordinator takes for a tile: it carries 22,600 a second (docs/reliability.md).
-const SERIAL: Duration = Duration::from_micros(44);
+const SERIAL: Duration = Duration::from_micros(27);
 
 /// How long a message is on its way.
 const LATENCY: Duration = Duration::from_micros(500);

@@ -140,12 +140,18 @@ impl Tiles {
         self.done_count
     }
 
+    /// Says whether a tile is in the picture.
+    pub(crate) fn is_done(&self, tile: TileId) -> bool {
+        matches!(self.by_number[tile.index()].state, State::Done { .. })
+    }
+
     /// The tiles at these places, in the order of rendering.
     pub(crate) fn at(&self, places: &BTreeSet<Place>) -> Vec<TileId> {
         places.iter().map(|&place| self.tile(place)).collect()
     }
 
-    fn tile(&self, place: Place) -> TileId {
+    /// The tile at a place.
+    pub(crate) fn tile(&self, place: Place) -> TileId {
         self.order[place.0 as usize]
     }
 

@@ -66,6 +66,9 @@ impl Farm {
             audit: 0.0,
             keeping: Keeping::default(),
             upload_silence: Duration::from_millis(600),
+            events: None,
+            begins_coarsely: false,
+            host: None,
             scene_folder: folder.path().to_owned(),
             picture_folder: folder.path().to_owned(),
         })

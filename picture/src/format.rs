@@ -26,7 +26,7 @@ impl PictureFormat {
     }
 
     /// Pixels, which come as little-endian f32, as the picture's file holds them.
-    pub(crate) fn encode(self, pixels: &[u8], transfer: Transfer) -> Vec<u8> {
+    pub fn encode(self, pixels: &[u8], transfer: Transfer) -> Vec<u8> {
         let (pixels, _) = pixels.as_chunks::<PIXEL_BYTES>();
         let mut bytes = Vec::with_capacity(pixels.len() * self.bytes_per_pixel());
         for light in pixels.iter().flat_map(channels) {
@@ -45,7 +45,7 @@ impl PictureFormat {
 }
 
 /// Clamps to `0..=1`, encodes and rounds to the nearest step, halves upwards.
-fn quantize(channel: f32, transfer: Transfer, steps: f64) -> f64 {
+pub(crate) fn quantize(channel: f32, transfer: Transfer, steps: f64) -> f64 {
     (transfer.encode(f64::from(channel).clamp(0.0, 1.0)) * steps + 0.5).floor()
 }
 

@@ -2,7 +2,6 @@
 
 use std::{
     io::{Read, Write},
-    net::TcpStream,
     os::unix::fs::PermissionsExt,
 };
 
@@ -154,6 +153,21 @@ fn who_has_no_token_or_that_of_another_role_or_farm_is_refused_and_told_why() {
 }
 
 #[test]
+fn certificates_made_before_are_those_of_the_coordinator() {
+    let place = Place::new();
+    let certs = ["certs", "--state", "farm", "--name", "renderhost", "--port", "7"];
+    assert_eq!(ask(&place, &certs), (Some(0), "farm/access\n".to_owned()));
+    let made = fs::read_to_string(place.path("farm/access/read")).unwrap();
+    assert!(made.contains("address https://renderhost:7\n"), "{made}");
+    check_refused(&place, &["certs", "--state", "farm", "--name", "a b"], 2, "");
+    let (_coordinator, url) = start_farm(&place);
+    fs::write(place.path("read"), made).unwrap();
+    fs::set_permissions(place.path("read"), fs::Permissions::from_mode(0o600)).unwrap();
+    let (code, said) = ask(&place, &["jobs", "--access", "read", "--coordinator", &url]);
+    assert_eq!(code, Some(0), "{said}");
+}
+
+#[test]
 fn a_socket_in_a_folder_of_ones_own_needs_no_token_and_another_is_refused() {
     let place = Place::new();
     fs::create_dir(place.path("own")).unwrap();
@@ -175,4 +189,31 @@ fn a_socket_in_a_folder_of_ones_own_needs_no_token_and_another_is_refused() {
     assert_eq!(code, Some(0), "{said}");
     coordinator.signal(Signal::TERM);
     assert_eq!(coordinator.wait().code(), Some(0));
+}
+
+#[test]
+fn a_page_from_elsewhere_cannot_have_a_browser_call_a_farm_that_asks_for_nothing() {
+    let place = Place::new();
+    let listen = ["coordinator", "--listen", "127.0.0.1:0", "--insecure"];
+    let mut coordinator = place.start("coordinator.log", &listen);
+    let line = coordinator.read_line();
+    let address = line.trim().strip_prefix("listening on http://").unwrap().to_owned();
+    let ask = |head: &str| {
+        let mut stream = TcpStream::connect(&address).unwrap();
+        stream.set_read_timeout(Some(PATIENCE)).unwrap();
+        write!(stream, "{head}\r\nConnection: close\r\n\r\n").unwrap();
+        let mut answer = Vec::new();
+        stream.read_to_end(&mut answer).unwrap();
+        String::from_utf8_lossy(&answer).to_lowercase()
+    };
+    let page = ask("GET / HTTP/1.1\r\nHost: 127.0.0.1:1");
+    assert!(page.starts_with("http/1.1 200 ") && page.contains("<!doctype html>"), "{page}");
+    let foreign = ask("GET / HTTP/1.1\r\nHost: evil.example");
+    assert!(foreign.starts_with("http/1.1 421 "), "{foreign}");
+    // A browser sends this for a page of anybody's, without asking first.
+    let call = "POST /rtfarm.v1.Jobs/List HTTP/1.1\r\nHost: 127.0.0.1\r\n\
+                Origin: http://evil.example\r\nContent-Type: text/plain\r\nContent-Length: 0";
+    let called = ask(call);
+    assert!(called.contains("grpc-status: 9") && called.contains("http/2"), "{called}");
+    assert!(!called.contains("access-control"), "{called}");
 }

@@ -215,7 +215,8 @@ impl Farm {
                 job.progress.worker_count = earlier.worker_count;
                 job.progress.tiles_done = tiles.done_count();
                 job.earlier = earlier;
-                job.tallies.clear();
+                job.brought.clear();
+                job.costs = rtfarm_job::TileCosts::default();
                 tiles
             }
             (None, None) => return refused(Refused::TilesUnknown),

@@ -87,7 +87,9 @@ pub(super) fn check(view: &View<'_>) -> Result<(), &'static str> {
         let last_rank = u64::from(solid.rank) + 6 * leaves.len() as u64;
         ensure(last_rank <= Child::ITEM_LIMIT as u64, "a solid")?;
         let is_framed = is_scale(solid.frame.scale) && finite(&solid.frame.origin);
-        ensure(is_framed && finite(&[solid.margin]) && solid.margin > 0.0, "a solid's frame")?;
+        ensure(is_framed && finite(&[solid.margin]), "a solid's frame")?;
+        let is_doubt = 0.0 < solid.most_doubt && solid.most_doubt <= solid.margin / 8.0;
+        ensure(is_doubt, "a solid's margin")?;
     }
     let roots = view.solids.iter().map(|solid| (solid.first_box as usize, solid.leaves().len()));
     check_hierarchies(view.solid_boxes, roots)?;

@@ -217,9 +217,11 @@ pub(crate) struct SolidRecord {
     /// The frame of the hierarchy's boxes: its origin is the middle of the solid, and 1 / `scale`
     /// is its size, within a factor of 2.
     pub(crate) frame: Frame,
-    /// The boxes of the leaves are larger by this on every side, and no crossing of a leaf is in
-    /// doubt by more than an eighth of it: what a ray passes by farther off changes nothing.
+    /// The boxes of the leaves are larger by this on every side: what a ray passes by farther off
+    /// changes nothing.
     pub(crate) margin: f64,
+    /// No crossing of a leaf is in doubt by more than this, which is an eighth of the margin at most.
+    pub(crate) most_doubt: f64,
     first_node: u32,
     node_count: u32,
     first_leaf: u32,
@@ -237,6 +239,7 @@ impl SolidRecord {
         Self {
             frame: Frame { origin: [0.0; 3], scale: 1.0 },
             margin: 0.0,
+            most_doubt: 0.0,
             first_node: nodes.start as u32,
             node_count: nodes.len() as u32,
             first_leaf: leaves.start as u32,

@@ -2,13 +2,25 @@
 
 use glam::DVec3;
 
-use super::wavefront::CameraSample;
 use crate::{
     prepared::record::{Camera, Surface},
-    sample::{AT_ONCE, positions},
+    sample::{AT_ONCE, Sample, positions},
     tile::Size,
     trace::{kernels::LaneWork, ray::Ray},
 };
+
+/// A camera ray that is wanted.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct CameraSample {
+    /// The pixel's column.
+    pub(super) x: u32,
+    /// The pixel's row.
+    pub(super) y: u32,
+    /// Its random numbers.
+    pub(super) sample: Sample,
+    /// The side of the square that it stands for, in pixels.
+    pub(super) width: f64,
+}
 
 /// Makes the camera rays of samples.
 pub(super) struct CameraRays<'a> {

@@ -5,11 +5,12 @@ use std::ops::{ControlFlow, Range};
 use glam::DVec3;
 
 use super::{
+    camera_rays::CameraSample,
     pixel::{Estimate, Neighbourhood, Pixel, Runs, Wanted},
     settings::{Quality, Sampling},
     tally::Tally,
     unseen::{FirstSample, UnseenFaces, UnseenSearch},
-    wavefront::{CameraSample, Wavefront},
+    wavefront::Wavefront,
 };
 use crate::{
     isa::Isa,

@@ -9,7 +9,10 @@ use std::ops::ControlFlow;
 
 use glam::DVec3;
 
-use super::{camera_rays::CameraRays, settings::Quality};
+use super::{
+    camera_rays::{CameraRays, CameraSample},
+    settings::Quality,
+};
 use crate::{
     isa::Isa,
     left_out,
@@ -38,19 +41,6 @@ const FULL_WEIGHT: f64 = 1.0 / 256.0;
 
 /// A queue of more rays than this is worked through in parts, as long as it has several samples.
 const MOST_RAYS: usize = 4096;
-
-/// A camera ray that is wanted.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct CameraSample {
-    /// The pixel's column.
-    pub(super) x: u32,
-    /// The pixel's row.
-    pub(super) y: u32,
-    /// Its random numbers.
-    pub(super) sample: Sample,
-    /// The side of the square that it stands for, in pixels.
-    pub(super) width: f64,
-}
 
 /// Samples on their way, and the queues that they pass through.
 #[derive(Debug, Default)]

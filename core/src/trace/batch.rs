@@ -6,7 +6,8 @@
 use std::ops::ControlFlow;
 
 use super::{
-    boxes::{BoxKernel, BoxRay, KernelWork},
+    box_ray::BoxRay,
+    boxes::{BoxKernel, KernelWork},
     hit::{Nearest, between, is_between, take_crossing},
     kernels::run_with_kernel,
     lanes::{CLASSES, MOST_RAYS},

@@ -17,7 +17,8 @@ use std::arch::x86_64::{
 };
 
 use super::{
-    boxes::{BoxKernel, BoxRay, FAR, KernelWork, NEAR, NEAR_FRAME},
+    box_ray::{BoxRay, FAR, NEAR, NEAR_FRAME},
+    boxes::{BoxKernel, KernelWork},
     lanes::{Beam, CLASSES, Crossings, GROUPS, LANES, LEAST_COMPONENT, RayGroup, Turn},
     ray::Ray,
 };

@@ -93,11 +93,11 @@ impl<'a> Course<'a> {
         }
     }
 
-    /// How far rounding may move a crossing of a leaf along the ray, which meets it at a cosine. No
-    /// more than the boxes of leaves have for it.
+    /// How far rounding may move a crossing of a leaf along the ray, which meets it at a cosine; no
+    /// more than counts in the solid.
     fn doubt(&self, leaf: &LeafRecord, ulp: f64, t: f64, cosine: f64) -> f64 {
         let bound = ulp * f64::EPSILON * (leaf.extent + self.size + t.abs()) / cosine;
-        bound.min(self.solid.margin / 8.0)
+        bound.min(self.solid.most_doubt)
     }
 
     /// An end of the stretch inside a leaf; rounding moves it no farther than its doubt.

@@ -3,7 +3,8 @@
 use glam::DVec3;
 
 use super::{
-    boxes::{BoxKernel, BoxRay},
+    box_ray::BoxRay,
+    boxes::BoxKernel,
     course::Crossing,
     quadrangle::{hit_plane, hit_quadrangle, is_inside},
     ray::{Hit, Ray, Shear},

@@ -50,7 +50,8 @@ mod tests {
             record::Surface,
         },
         trace::{
-            boxes::{BoxKernel, BoxRay},
+            box_ray::BoxRay,
+            boxes::BoxKernel,
             lanes::{CLASSES, Crossings, LANES, MOST_RAYS, RayGroup, class_of},
             packet::Packet,
             ray::{Ray, Shear},

@@ -1,7 +1,7 @@
 //! Rays side by side, a lane each, and the tests that several of them take at once.
 
 use super::{
-    boxes::{BoxRay, FAR, NEAR_FRAME},
+    box_ray::{BoxRay, FAR, NEAR_FRAME},
     ray::{Ray, Shear, depth_axis, edge},
 };
 use crate::{

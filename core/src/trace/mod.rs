@@ -1,6 +1,7 @@
 //! Rays through a prepared scene: what they meet.
 
 pub(crate) mod batch;
+mod box_ray;
 mod boxes;
 #[cfg(target_arch = "x86_64")]
 #[expect(unsafe_code, reason = "SIMD intrinsics")]

@@ -10,7 +10,8 @@
 //! on the Intel MIC Architecture" (2012).
 
 use super::{
-    boxes::{BoxKernel, BoxRay, FAR},
+    box_ray::{BoxRay, FAR},
+    boxes::BoxKernel,
     lanes::{Beam, GROUPS, LANES, MOST_RAYS, RayGroup, Turn, larger, shear_at, smaller},
     ray::{Ray, Shear},
     traversal::{STACK, Stack, Step, visit_from},

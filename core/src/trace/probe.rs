@@ -6,7 +6,8 @@ use glam::DVec3;
 
 use super::{
     batch::trace,
-    boxes::{BoxRay, ScalarBoxes},
+    box_ray::BoxRay,
+    boxes::ScalarBoxes,
     hit::{Nearest, between},
     quadrangle::is_inside_in_doubt,
     ray::{Hit, Ray, Shear},

@@ -10,7 +10,8 @@
 //! docs/proof.md says why what is passed over changes no bit.
 
 use super::{
-    boxes::{BoxKernel, BoxRay},
+    box_ray::BoxRay,
+    boxes::BoxKernel,
     course::{Course, Crossing, End, Pin},
     ray::Ray,
     walk::{Walk, Walked},

@@ -1,9 +1,6 @@
 //! The way of a ray through the hierarchy.
 
-use super::{
-    boxes::{BoxKernel, BoxRay},
-    ray::Ray,
-};
+use super::{box_ray::BoxRay, boxes::BoxKernel, ray::Ray};
 use crate::prepared::{
     layout::View,
     node::{Child, MOST_LEVELS},

@@ -215,6 +215,27 @@ fn closed_surfaces_have_no_leaks_at_their_corners() {
 }
 
 #[test]
+fn halves_of_a_solid_keep_their_walls_for_rays_along_the_plane_that_they_share() {
+    for (stream, place) in (0..).zip(PLACES) {
+        let surface = shell(place);
+        let block = opened(&surface.scene);
+        let mut random = random(120 + stream);
+        let probes: Vec<Probe> = (0..rays(5_000))
+            .map(|_| {
+                let along = random.direction() * DVec3::new(0.0, 1.0, 1.0);
+                let off = random.sign() * random.log_uniform(1e-12, 1e-3);
+                let direction = (along.normalize() + off * DVec3::X).normalize();
+                Probe { origin: surface.inside[0], direction, leaving: None }
+            })
+            .collect();
+        let crossings = block.count_crossings(&probes);
+        for (probe, count) in probes.iter().zip(crossings) {
+            assert_eq!(count, 2, "moved by {}, scaled by {}: {probe:?}", place.0, place.1);
+        }
+    }
+}
+
+#[test]
 fn surfaces_of_triangles_and_quadrangles_have_no_leaks_where_they_join() {
     let what = "no ray gets through where quadrangles and triangles join";
     check_no_leaks(HardCase::MixedSharedEdge, what, false, &KINDS[1..3]);

@@ -407,8 +407,12 @@ fn the_first_wins_of_a_quadrangle_and_triangles_over_it() {
     );
 }
 
-/// A wall and a label on it, in thousandths, so that both are in one plane in decimals, and what
-/// the label is moved by for each unit of `apart`: a rounding of the coordinates.
+/// Labels are seen from so far away.
+const LABEL_DISTANCE: f64 = 0.5;
+
+/// A wall and a label on it, in thousandths, so that both are in one plane in decimals. For each unit
+/// of `apart` the label is moved by a rounding: of the coordinates across the plane, or of what a ray
+/// measures if that is more, its own length and its start's distance from the middle of the wall.
 fn wall_and_label(random: &mut Random, apart: f64) -> ([DVec3; 4], [DVec3; 4]) {
     let whole = |size: f64, random: &mut Random| (random.in_cube() * size).round();
     let place = whole(900.0, random);
@@ -424,8 +428,10 @@ fn wall_and_label(random: &mut Random, apart: f64) -> ([DVec3; 4], [DVec3; 4]) {
     let square = |from: f64, to: f64| [at(from, from), at(to, from), at(to, to), at(from, to)];
     let wall = square(0.0, 8.0);
     let extent = wall.iter().fold(DVec3::ZERO, |most, corner| most.max(corner.abs()));
-    let rounding = f64::EPSILON / 2.0 * normal.abs().dot(extent);
-    (wall, square(3.0, 5.0).map(|corner| corner + apart * rounding * normal))
+    let label = square(3.0, 5.0);
+    let half = label[0].distance(label[2]).max(label[1].distance(label[3])) / 2.0;
+    let rounding = f64::EPSILON / 2.0 * normal.abs().dot(extent).max(half + 2.0 * LABEL_DISTANCE);
+    (wall, label.map(|corner| corner + apart * rounding * normal))
 }
 
 fn quadrangles(faces: [[DVec3; 4]; 2]) -> Scene {
@@ -446,7 +452,7 @@ fn rays_at_label(label: &[DVec3; 4], side: f64, random: &mut Random) -> Vec<Prob
         .map(|_| {
             let place = a + u * random.between(0.01, 0.99) + v * random.between(0.01, 0.99);
             let away = (normal + random.in_cube() * 0.5).normalize();
-            Probe { origin: place + away * 0.5, direction: -away, leaving: None }
+            Probe { origin: place + away * LABEL_DISTANCE, direction: -away, leaving: None }
         })
         .collect()
 }
