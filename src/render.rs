@@ -195,7 +195,7 @@ pub(crate) async fn run(
     stop: &CancellationToken,
 ) -> Result<(), Failure> {
     let started = Instant::now();
-    if args.show && args.workers_and_threads().0 == 0 {
+    if args.show && args.workers_and_threads().0 == 0 && args.slurm.is_none() {
         return Err(Failure::Input(anyhow!(
             "--show is a coordinator's, and with --workers 0 there is none"
         )));

@@ -343,11 +343,13 @@ impl jobs_server::Jobs for JobsService {
         let job = self.job(job, &farm)?;
         let mut progress = job.progress();
         let (send, receive) = mpsc::channel(1);
-        let shell = Arc::clone(&self.shell);
+        // A stream that nobody ends does not keep the coordinator.
+        let shell = Arc::downgrade(&self.shell);
+        let lacks_workers_now = move || shell.upgrade().is_some_and(|shell| shell.lacks_workers());
         tokio::spawn(async move {
             loop {
                 let mut event = to_event(&progress.borrow_and_update());
-                let lacks_workers = shell.lacks_workers();
+                let lacks_workers = lacks_workers_now();
                 add_lack(&mut event, lacks_workers);
                 let is_last = event.end.is_some();
                 if send.send(Ok(event)).await.is_err() || is_last {
@@ -355,7 +357,7 @@ impl jobs_server::Jobs for JobsService {
                 }
                 tokio::time::sleep(WATCH_PERIOD).await;
                 let other_workers = async {
-                    while shell.lacks_workers() == lacks_workers {
+                    while lacks_workers_now() == lacks_workers {
                         tokio::time::sleep(WORKERS_PERIOD).await;
                     }
                 };

@@ -80,7 +80,7 @@ impl Browser {
         while !line.trim().is_empty() {
             line.clear();
             answer.read_line(&mut line)?;
-            let (name, value) = line.split_once(": ").unwrap_or_default();
+            let (name, value) = line.split_once(':').unwrap_or_default();
             if name.eq_ignore_ascii_case("content-length") {
                 length = value.trim().parse().unwrap_or_default();
             }

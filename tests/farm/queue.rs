@@ -86,7 +86,8 @@ fn people_can_live_with_the_queue() {
     assert_eq!(of_first["max_workers"], 2);
     assert_eq!(of_first["state"], "waiting");
     let table = ask(&place, &url, &["jobs"]).1;
-    assert_eq!(table.lines().count(), 3, "{table}");
+    assert_eq!(table.lines().count(), 5, "{table}");
+    assert!(table.ends_with(&format!("job {second} waits: the farm has no worker\n")), "{table}");
 
     assert_eq!(json(&place, &url, &["priority", &second, "5"])["priority"], 5);
     assert_eq!(order(&place, &url), [&second[..], &first]);
