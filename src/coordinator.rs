@@ -61,6 +61,7 @@ pub(crate) async fn run(
             byte_count: u64::from(args.keep_gb) * 1_000_000_000,
         },
         upload_silence: args.upload_seconds,
+        orders: args.orders(),
         scene_folder: folder.clone(),
         picture_folder: folder,
     };

@@ -8,7 +8,7 @@ use std::{
 };
 
 use anyhow::{Context, anyhow};
-use rtfarm_coordinator::{Config, Coordinator, Job, Keeping, Listener};
+use rtfarm_coordinator::{Config, Coordinator, Job, Keeping, Listener, OrderLimits};
 use rtfarm_core::{
     isa::Isa,
     language::{Style, draw_diagnostics},
@@ -382,6 +382,7 @@ impl Render<'_> {
             audit: if is_here { 0.0 } else { AUDIT },
             keeping: Keeping::default(),
             upload_silence: UPLOAD_SILENCE,
+            orders: OrderLimits::default(),
             scene_folder: folder.path().to_owned(),
             picture_folder: first.output.folder(),
         })?;

@@ -295,9 +295,9 @@ fn paths_are_read_with_their_braces() {
 }
 
 /// The coordinator's files, each of which knows earlier ones only.
-const COORDINATOR: [&str; 18] = [
-    "identity", "tiles", "pace", "lease", "members", "waiting", "audit", "farm", "store", "record",
-    "state", "job", "shell", "accept", "security", "guard", "service", "run",
+const COORDINATOR: [&str; 19] = [
+    "upload", "identity", "tiles", "pace", "lease", "members", "waiting", "audit", "farm", "store",
+    "record", "state", "job", "shell", "accept", "security", "guard", "service", "run",
 ];
 
 #[test]

@@ -7,6 +7,7 @@
 //! knows only what stands before it:
 //!
 //! ```text
+//! upload <- shell, service
 //! identity, tiles, pace <- lease, members, waiting, audit <- farm, store, record <- state <- job
 //! job <- shell <- service <- run
 //! security, accept <- guard <- service; accept <- run
@@ -37,6 +38,7 @@ mod state;
 mod steady;
 mod store;
 mod tiles;
+mod upload;
 mod waiting;
 #[cfg(test)]
 mod whole_farm;
@@ -48,3 +50,4 @@ pub use run::{Coordinator, Listener, ServeError};
 pub use security::{Role, Security, SecurityError, renew_token, revoke_token};
 pub use shell::{Config, SubmitError};
 pub use state::{Durability, StateError, StateFolder};
+pub use upload::OrderLimits;

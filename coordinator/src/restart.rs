@@ -27,6 +27,7 @@ use crate::{
     record::Ticket,
     shell::{Config, Shell},
     state::{Durability, StateError, StateFolder},
+    upload::OrderLimits,
 };
 
 const BUILD: &str = "1.2.3 test";
@@ -77,6 +78,7 @@ impl Coordinator {
             keeping: Keeping::default(),
             term: Duration::from_secs(4),
             upload_silence: Duration::from_secs(4),
+            orders: OrderLimits::default(),
             scene_folder: PathBuf::new(),
             picture_folder: PathBuf::new(),
         };

@@ -34,6 +34,7 @@ use crate::{
     state::{Durability, KeptJob, StateFolder},
     store::SceneFile,
     tiles::{MOST_LOSSES, Tiles},
+    upload::OrderLimits,
     waiting::{Ask, AskId},
 };
 
@@ -56,7 +57,9 @@ pub struct Config {
     pub keeping: Keeping,
     /// A client that sends nothing of its scene for this long is given up.
     pub upload_silence: Duration,
-    /// For prepared scenes: a folder that is nobody else's.
+    /// How much may be ordered.
+    pub orders: OrderLimits,
+    /// For scenes: a folder that is nobody else's.
     pub scene_folder: PathBuf,
     /// For pictures while they are rendered.
     pub picture_folder: PathBuf,
@@ -100,6 +103,8 @@ pub(crate) struct Shell {
     state: Mutex<State>,
     /// Held while a job is made or changed and that is kept: one at a time.
     changing: Mutex<()>,
+    /// Held while it is found out whether there is room for an order, and it is taken.
+    pub(crate) ordering: Mutex<()>,
     /// Told when the machine wants to be woken earlier than it will be.
     earlier: Notify,
     /// Cancelled when everybody has gone home: connections are to be closed.
@@ -206,6 +211,7 @@ impl Shell {
             written: Notify::new(),
             state: Mutex::new(state),
             changing: Mutex::default(),
+            ordering: Mutex::default(),
             earlier: Notify::new(),
             stop: CancellationToken::new(),
         };

@@ -54,6 +54,7 @@ use crate::{
     shell::Shell,
     simulation::SplitMix64,
     state::{Durability, StateFolder},
+    upload::OrderLimits,
 };
 
 const SEEDS: u64 = 500;
@@ -362,6 +363,7 @@ impl World {
             term: TERM,
             audit: f64::from(u8::from(self.hosts[0].is_liar)),
             upload_silence: Duration::from_secs(5),
+            orders: OrderLimits::default(),
             scene_folder: self.folder.path().to_owned(),
             picture_folder: self.folder.path().to_owned(),
             keeping: Keeping::default(),
