@@ -153,7 +153,7 @@ impl Page {
         let shown = parts.headers.get(AUTHORIZATION).map(HeaderValue::as_bytes);
         let checked = match &self.keeper {
             Keeper::Nobody => Ok(()),
-            Keeper::Farm(security) => security.check(parts.uri.path(), shown),
+            Keeper::Farm(security) => security.check(parts.uri.path(), shown).map(drop),
             Keeper::Token(hash) => {
                 let token = shown.and_then(|shown| shown.strip_prefix(b"Bearer "));
                 // Hashes of this kind are compared in constant time.
@@ -328,6 +328,7 @@ mod tests {
             events: None,
             begins_coarsely: false,
             host: Some("farm.example".to_owned()),
+            orders: crate::upload::OrderLimits::default(),
             scene_folder: folder.to_owned(),
             picture_folder: folder.to_owned(),
         };
