@@ -152,7 +152,7 @@ struct Rendered {
 }
 
 enum Drawn {
-    Here(Canvas, Provenance),
+    Here(Box<(Canvas, Provenance)>),
     Job(Arc<Job>),
 }
 
@@ -160,7 +160,8 @@ impl Drawn {
     /// Writes the picture's file.
     fn encode(&self, out: impl Write + Seek) -> io::Result<()> {
         match self {
-            Self::Here(canvas, provenance) => {
+            Self::Here(here) => {
+                let (canvas, provenance) = &**here;
                 let provenance = provenance.text(&canvas.tally()?);
                 let software = format!("rtfarm {}", software());
                 canvas.picture().encode(&Notes { software, provenance }, out)
@@ -305,7 +306,7 @@ impl Render<'_> {
                     format: order.format,
                 };
                 let (canvas, tally, rendering) = self.render_here(order, begun).await?;
-                (Drawn::Here(canvas, provenance), tally, rendering)
+                (Drawn::Here(Box::new((canvas, provenance))), tally, rendering)
             }
             Work::Job(job) => {
                 let rendering = wait(&job, self.console).await?;

@@ -2,6 +2,7 @@
 //! that the picture's size is not limited by memory.
 
 use std::{
+    fmt::Write as _,
     io::{self, Write},
     ops::ControlFlow,
     path::Path,
@@ -58,16 +59,17 @@ impl Found {
             text = format!("{json:#}\n");
         } else {
             for difference in differences.iter().chain(other_build) {
-                text += &format!("{difference}\n");
+                text += difference;
+                text += "\n";
             }
             if differences.is_empty() {
                 let right = checked - wrong.len();
-                text +=
-                    &format!("{right} of {checked} tiles are the same to the bit, of {tile_count}");
-                if !wrong.is_empty() {
-                    text += &format!("; others are {wrong:?}");
-                }
-                text += "\n";
+                let others = if wrong.is_empty() { "" } else { &format!(", but not {wrong:?}") };
+                let _ = writeln!(
+                    text,
+                    "{checked} of {tile_count} tiles were rendered again: \
+                     {right} are the same to the bit{others}"
+                );
             }
         }
         io::stdout()
@@ -219,7 +221,9 @@ mod tests {
                 let chosen = choose(TileShare::Some(wanted), count).unwrap();
                 let tiles: Vec<u32> = (0..count).filter(|&tile| chosen(tile)).collect();
                 assert_eq!(tiles.len() as u32, wanted.min(count), "{count} {wanted}");
-                tiles.iter().for_each(|&tile| seen[tile as usize] = true);
+                for &tile in &tiles {
+                    seen[tile as usize] = true;
+                }
             }
             assert!(seen.iter().all(|&seen| seen), "{count} {wanted}");
         }

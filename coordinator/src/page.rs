@@ -30,6 +30,7 @@ use tonic::{
             HeaderValue, Method, Request, Response, StatusCode,
             header::{AUTHORIZATION, HOST, WWW_AUTHENTICATE},
             request::Parts,
+            uri::Authority,
         },
     },
 };
@@ -118,11 +119,11 @@ impl Page {
             }
             _ => {}
         }
-        if let Err(response) = self.check_token(&parts) {
+        if let Some(response) = self.refusal(&parts) {
             return response;
         }
         let answer = match path {
-            "/page/events" => self.events(&parts).await,
+            "/page/events" => self.events(&parts),
             "/page/pixel" => self.pixel(&parts).await,
             "/metrics" => {
                 let body = Body::new(Full::new(Bytes::from(metrics::text(&self.shell))));
@@ -137,7 +138,7 @@ impl Page {
     /// somebody who wants to look through the eyes of the browser's user.
     fn is_host(&self, parts: &Parts) -> bool {
         let header = || parts.headers.get(HOST).and_then(|host| host.to_str().ok());
-        let host = parts.uri.authority().map(|authority| authority.as_str()).or_else(header);
+        let host = parts.uri.authority().map(Authority::as_str).or_else(header);
         let Some(host) = host else { return false };
         let name = match host.rsplit_once(':') {
             Some((name, port)) if port.parse::<u16>().is_ok() => name,
@@ -149,7 +150,8 @@ impl Page {
             || self.shell.config.host.as_ref().is_some_and(|ours| ours.eq_ignore_ascii_case(name))
     }
 
-    fn check_token(&self, parts: &Parts) -> Result<(), Response<Body>> {
+    /// Answers who shows no token that may read.
+    fn refusal(&self, parts: &Parts) -> Option<Response<Body>> {
         let shown = parts.headers.get(AUTHORIZATION).map(HeaderValue::as_bytes);
         let checked = match &self.keeper {
             Keeper::Nobody => Ok(()),
@@ -169,16 +171,16 @@ impl Page {
             };
             let mut response = refused(code, status.message());
             response.headers_mut().insert(WWW_AUTHENTICATE, HeaderValue::from_static("Bearer"));
-            return Err(response);
+            return Some(response);
         }
         if let Some(peer) = parts.extensions.get::<Peer>() {
             peer.admit();
         }
-        Ok(())
+        None
     }
 
     /// Streams what there is to see of a job, or of a farm without any, as server-sent events.
-    async fn events(&self, parts: &Parts) -> Result<Response<Body>, (StatusCode, &'static str)> {
+    fn events(&self, parts: &Parts) -> Result<Response<Body>, (StatusCode, &'static str)> {
         let viewer = Arc::clone(&self.viewers).try_acquire_owned();
         let viewer = viewer.map_err(|_| (StatusCode::SERVICE_UNAVAILABLE, "too many watch"))?;
         let job = match asked::<u64>(parts, "job") {
@@ -235,15 +237,14 @@ async fn tell(shell: &Arc<Shell>, feed: &Arc<Feed>, seen: Option<Seen>, send: &S
     loop {
         news.mark_unchanged();
         let new = seen.as_mut().and_then(|seen| feed.after(seen));
-        let messages = match new {
-            Some(messages) => messages,
-            None => {
-                let (shell, feed) = (Arc::clone(shell), Arc::clone(feed));
-                let all = tokio::task::spawn_blocking(move || feed.all(&shell)).await;
-                let Ok(Ok((at, messages))) = all else { return };
-                seen = Some(at);
-                messages
-            }
+        let messages = if let Some(messages) = new {
+            messages
+        } else {
+            let (shell, feed) = (Arc::clone(shell), Arc::clone(feed));
+            let all = tokio::task::spawn_blocking(move || feed.all(&shell)).await;
+            let Ok(Ok((at, messages))) = all else { return };
+            seen = Some(at);
+            messages
         };
         for message in messages {
             if send.send(Ok(Frame::data(message))).await.is_err() {

@@ -83,8 +83,9 @@ impl Role {
         };
         let reads = matches!(method, "List" | "Workers" | "Watch" | "Image" | "Explain");
         match (self, service) {
-            (Self::Admin, _) | (Self::Work, "rtfarm.v1.Farm") => true,
-            (Self::Read | Self::Submit, "page") => true,
+            (Self::Admin, _)
+            | (Self::Work, "rtfarm.v1.Farm")
+            | (Self::Read | Self::Submit, "page") => true,
             (Self::Read, "rtfarm.v1.Jobs") => reads,
             (Self::Submit, "rtfarm.v1.Jobs") => {
                 reads || matches!(method, "Submit" | "Cancel" | "Control")

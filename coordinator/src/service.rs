@@ -644,7 +644,7 @@ fn ordered(shell: &Shell) -> Ordered {
         all.bytes += terms.byte_count;
         if !matches!(phase, JobPhase::Finished | JobPhase::Failed) {
             all.jobs += 1;
-            all.pixels += job.grid.window().size().pixel_count() as u64;
+            all.pixels += job.grid.window().size().pixel_count();
         }
     }
     all
@@ -654,7 +654,7 @@ fn ordered(shell: &Shell) -> Ordered {
 fn to_be_ordered(order: &Order) -> Ordered {
     let size = order.grid.window().size();
     let bytes = order.prepared.as_ref().len() as u64 + Picture::byte_count(size, order.format);
-    Ordered { jobs: 1, pixels: size.pixel_count() as u64, bytes }
+    Ordered { jobs: 1, pixels: size.pixel_count(), bytes }
 }
 
 fn cannot_spool(error: &io::Error) -> Status {

@@ -130,7 +130,9 @@ fn expected(number: usize) -> &'static [u8] {
             tallies.insert(tile, rendered.tally);
         }
         let mut sum = Tally::default();
-        tallies.values().for_each(|tally| sum.add(tally));
+        for tally in tallies.values() {
+            sum.add(tally);
+        }
         let software = format!("rtfarm {}", provenance.build);
         let notes = Notes { software, provenance: provenance.text(&sum) };
         let mut file = std::io::Cursor::new(Vec::new());
