@@ -1,7 +1,7 @@
 //! The command line's words.
 
 use std::{
-    fmt, fs, ops::RangeInclusive, os::unix::fs::PermissionsExt, path::PathBuf, str::FromStr,
+    fmt, fs, ops::RangeInclusive, os::unix::fs::MetadataExt, path::PathBuf, str::FromStr,
     time::Duration,
 };
 
@@ -88,6 +88,8 @@ pub(crate) enum Command {
     Watch(WatchArgs),
     /// Fetch the picture of a finished job, which the farm then forgets.
     Image(ImageArgs),
+    /// Say what became of a tile: who rendered it, who lost it and why.
+    Explain(ExplainArgs),
     /// End a job and forget it.
     Cancel(JobArgs),
     /// Give workers no more tiles of a job; those in work are taken.
@@ -104,8 +106,14 @@ pub(crate) enum Command {
     Disable(StationArgs),
     /// Give tiles again to a worker that was disabled or is drained.
     Enable(StationArgs),
+    /// Make the certificates, tokens and access files of a farm before its coordinator is started.
+    Certs(CertsArgs),
     /// Renew or revoke a token of a farm; its coordinator need not be stopped.
     Tokens(TokensArgs),
+    /// Say whether a picture is what its scene gives: tiles of it are rendered again and compared.
+    ///
+    /// Exits with 0 when it is, with 1 when it is not, with 2 when that cannot be found out.
+    Verify(VerifyArgs),
     /// Say what is wrong with a scene, and what it needs.
     Check(CheckArgs),
     /// Write a shell's completions to standard output.
@@ -153,6 +161,71 @@ pub(crate) struct CheckArgs {
     /// Answer in JSON.
     #[arg(long, help_heading = TALK)]
     pub(crate) json: bool,
+}
+
+#[derive(Debug, ClapArgs)]
+pub(crate) struct CertsArgs {
+    /// The folder of the farm's state, which is made if there is none; DIR/access has all.
+    #[arg(long, value_name = "DIR", env = "RTFARM_STATE")]
+    pub(crate) state: PathBuf,
+
+    /// Where others will find the coordinator.
+    #[arg(long, value_name = "HOST", env = "RTFARM_NAME")]
+    pub(crate) name: String,
+
+    /// The port that it will listen on.
+    #[arg(long, value_name = "PORT", default_value = "7878")]
+    pub(crate) port: u16,
+}
+
+#[derive(Debug, ClapArgs)]
+pub(crate) struct VerifyArgs {
+    /// The picture, which says itself with which settings it was rendered.
+    #[arg(value_name = "IMAGE")]
+    pub(crate) image: PathBuf,
+
+    #[command(flatten)]
+    pub(crate) scene: SceneArgs,
+
+    /// So many tiles, which are drawn by chance, or `all`; by default some, at least 8 and at most 1024.
+    #[arg(long, value_name = "N|all", default_value = "few", hide_default_value = true, help_heading = WORK)]
+    pub(crate) tiles: TileShare,
+
+    /// Threads; all cores by default.
+    #[arg(long, value_name = "N", value_parser = value_parser!(u16).range(1..=1024), help_heading = WORK)]
+    threads: Option<u16>,
+
+    /// The instruction set that the kernels use; all give the same bytes.
+    #[arg(long, value_name = "auto|scalar|sse2|avx2", default_value = "auto", help_heading = WORK)]
+    pub(crate) isa: IsaChoice,
+
+    /// Answer in JSON.
+    #[arg(long, help_heading = TALK)]
+    pub(crate) json: bool,
+}
+
+/// How many tiles are rendered again.
+#[derive(Debug, Clone, Copy)]
+pub(crate) enum TileShare {
+    All,
+    Some(u32),
+    /// A few percent.
+    Few,
+}
+
+impl FromStr for TileShare {
+    type Err = &'static str;
+
+    fn from_str(text: &str) -> Result<Self, &'static str> {
+        match text {
+            "all" => Ok(Self::All),
+            "few" => Ok(Self::Few),
+            _ => match text.parse() {
+                Ok(count @ 1..) => Ok(Self::Some(count)),
+                _ => Err("a number of tiles is wanted, or `all`"),
+            },
+        }
+    }
 }
 
 #[derive(Debug, ClapArgs)]
@@ -536,7 +609,10 @@ impl AccessArgs {
             );
         };
         let read = || -> anyhow::Result<Access> {
-            let for_others = fs::metadata(path)?.permissions().mode() & 0o077;
+            let metadata = fs::metadata(path)?;
+            // Who gave another's file for this user to read knows what they do: a Kubernetes secret is so.
+            let is_own = metadata.uid() == rustix::process::geteuid().as_raw();
+            let for_others = metadata.mode() & if is_own { 0o077 } else { 0o007 };
             ensure!(for_others == 0, "others may read it; chmod 600 makes it yours alone");
             Ok(Access::read(&fs::read_to_string(path)?)?)
         };
@@ -568,6 +644,16 @@ pub(crate) struct JobArgs {
 
     #[command(flatten)]
     pub(crate) farm: FarmArgs,
+}
+
+#[derive(Debug, ClapArgs)]
+pub(crate) struct ExplainArgs {
+    #[command(flatten)]
+    pub(crate) job: JobArgs,
+
+    /// The tile's number, as the log and the page have it.
+    #[arg(value_name = "TILE")]
+    pub(crate) tile: u32,
 }
 
 #[derive(Debug, ClapArgs)]
@@ -726,6 +812,13 @@ impl CoordinatorArgs {
     pub(crate) fn limits(&self) -> Limits {
         let (handshake, first_word) = (self.handshake_seconds, self.greeting_seconds);
         Limits { handshake, first_word, strangers: self.strangers.into() }
+    }
+}
+
+impl VerifyArgs {
+    /// Threads that render.
+    pub(crate) fn threads(&self) -> usize {
+        self.threads.map_or_else(core_count, usize::from)
     }
 }
 

@@ -163,9 +163,15 @@ impl Bar {
         if progress.tiles_done > 0 {
             let seconds = self.start.elapsed().as_secs_f64();
             let tiles_left = f64::from(progress.tile_count - progress.tiles_done);
-            let left = seconds / f64::from(progress.tiles_done) * tiles_left;
+            let left = match progress.left {
+                Some(left) => {
+                    let [mean, error] = [left.mean, left.error].map(|time| time.as_secs_f64());
+                    format!("{mean:.0} ± {error:.0}")
+                }
+                None => format!("{:.0}", seconds / f64::from(progress.tiles_done) * tiles_left),
+            };
             let mrays = progress.tally.rays as f64 / 1e6 / seconds;
-            bar.set_message(format!("{mrays:.1} Mrays/s  {left:.0} s left"));
+            bar.set_message(format!("{mrays:.1} Mrays/s  {left} s left"));
         }
     }
 }

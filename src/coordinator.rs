@@ -24,7 +24,7 @@ use tokio_util::sync::CancellationToken;
 
 use crate::{
     BUILD, VERSION,
-    args::{CoordinatorArgs, TokenChange, TokensArgs},
+    args::{CertsArgs, CoordinatorArgs, TokenChange, TokensArgs},
     failure::Failure,
     output::folder_of,
     private_folder::PrivateFolder,
@@ -62,6 +62,7 @@ pub(crate) async fn run(
         },
         upload_silence: args.upload_seconds,
         events: args.events.clone(),
+        begins_coarsely: false,
         host: Some(args.name.clone().unwrap_or_else(own_name)),
         scene_folder: folder.clone(),
         picture_folder: folder,
@@ -154,6 +155,18 @@ impl Place {
 /// What this machine calls itself.
 fn own_name() -> String {
     rustix::system::uname().nodename().to_string_lossy().into_owned()
+}
+
+/// `rtfarm certs`.
+pub(crate) fn make_certificates(args: &CertsArgs) -> Result<(), Failure> {
+    let CertsArgs { state, name, port } = args;
+    let address = format!("https://{name}:{port}").parse().map_err(anyhow::Error::from);
+    let address = address.map_err(Failure::Input)?;
+    fs::create_dir_all(state).with_context(|| format!("cannot make {}", state.display()))?;
+    Security::open(state, &address).map_err(anyhow::Error::from)?;
+    writeln!(io::stdout().lock(), "{}", state.join("access").display())
+        .context("cannot write to standard output")?;
+    Ok(())
 }
 
 /// `rtfarm tokens`.

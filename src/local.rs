@@ -12,7 +12,7 @@ use std::{
 
 use rayon::ThreadPoolBuilder;
 use rtfarm_core::{isa::Isa, prepared::PreparedScene, render::render_tile, tile::TileId};
-use rtfarm_job::{FinishedTile, Order, Progress};
+use rtfarm_job::{FinishedTile, Order, Progress, TileCosts};
 use rtfarm_picture::{Canvas, CanvasTile, PutError, TileRecord, pixel_bytes};
 use tokio::{sync::watch, time::Instant};
 use tokio_util::sync::CancellationToken;
@@ -49,6 +49,7 @@ pub(crate) fn render(
     let started = Instant::now();
     let elapsed = || earlier + started.elapsed();
     let synced = Mutex::new(started);
+    let costs = Mutex::new(TileCosts::default());
     let on_progress = || {
         if stop.is_cancelled() { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
     };
@@ -81,6 +82,10 @@ pub(crate) fn render(
             progress.send_modify(|progress| {
                 progress.tiles_done += 1;
                 progress.tally.add(&rendered.tally);
+                let mut costs = costs.lock().expect("nothing here panics");
+                costs.add(seconds);
+                let tiles_left = progress.tile_count - progress.tiles_done;
+                progress.left = costs.time_left(tiles_left, started.elapsed());
                 now_done.clone_from(progress);
             });
             let rays = rendered.tally.rays;

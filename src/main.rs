@@ -24,6 +24,7 @@ mod show;
 mod slurm;
 mod source;
 mod submit;
+mod verify;
 mod worker;
 
 use std::process::ExitCode;
@@ -34,7 +35,7 @@ use tokio::signal::unix::{SignalKind, signal};
 use tokio_util::sync::CancellationToken;
 
 use crate::{
-    args::{Args, Command, JobArgs, PriorityArgs, StationArgs},
+    args::{Args, Command, ExplainArgs, JobArgs, PriorityArgs, StationArgs},
     console::Console,
     failure::Failure,
     queue::Wish,
@@ -86,6 +87,9 @@ async fn run(command: Command, console: &Console) -> Result<(), Failure> {
         Command::Jobs(args) => queue::run(args, Wish::Jobs, &stop).await,
         Command::Workers(args) => queue::run(args, Wish::Workers, &stop).await,
         Command::Cancel(args) => queue::run(args.farm, Wish::Cancel(args.job), &stop).await,
+        Command::Explain(ExplainArgs { job: JobArgs { job, farm }, tile }) => {
+            queue::run(farm, Wish::Explain(job, tile), &stop).await
+        }
         Command::Pause(JobArgs { job, farm }) => {
             queue::run(farm, Wish::Change(job, Change::Paused(true)), &stop).await
         }
@@ -107,8 +111,10 @@ async fn run(command: Command, console: &Console) -> Result<(), Failure> {
         Command::Enable(StationArgs { worker, farm }) => {
             queue::run(farm, Wish::Station(worker, Standing::Active), &stop).await
         }
+        Command::Certs(args) => coordinator::make_certificates(&args),
         Command::Tokens(args) => coordinator::change_tokens(&args),
         Command::Report(args) => report::run(args, console, &stop).await,
+        Command::Verify(args) => verify::run(args, &stop).await,
         Command::Check(args) => check::run(args, console, &stop).await,
         Command::Completions(args) => manual::write_completions(&args),
         Command::Man(args) => manual::write_pages(&args),

@@ -8,9 +8,9 @@ use std::{
 };
 
 use anyhow::{Context, anyhow};
-use rtfarm_client::{FIRST_PAUSE, LONGEST_PAUSE, is_lost, plain};
+use rtfarm_client::{FIRST_PAUSE, LONGEST_PAUSE, is_lost, plain, time_left};
 use rtfarm_core::{render::Tally, tile::Size};
-use rtfarm_job::Progress;
+use rtfarm_job::{Progress, TimeLeft};
 use rtfarm_proto::{
     Access, Reached,
     wire::{self, Standing, control_request::Change, event, jobs_client::JobsClient},
@@ -37,6 +37,7 @@ pub(crate) enum Wish {
     Workers,
     Cancel(u64),
     Change(u64, Change),
+    Explain(u64, u32),
     Station(u32, Standing),
 }
 
@@ -126,6 +127,11 @@ async fn ask(mut client: JobsClient<Reached>, wish: Wish) -> anyhow::Result<Answ
             let request = wire::ControlRequest { job, change, ..wire::ControlRequest::default() };
             client.control(request).await.map_err(refused)?;
             done(&[("job", job.to_string().into()), (key, value)], format!("job {job} {text}"))
+        }
+        Wish::Explain(job, tile) => {
+            let request = wire::ExplainRequest { job, tile, ..wire::ExplainRequest::default() };
+            let told = client.explain(request).await.map_err(refused)?.into_inner();
+            explain(job, tile, &told)
         }
         Wish::Station(worker, standing) => {
             let request = wire::StationRequest { worker, standing: standing.into() };
@@ -221,8 +227,55 @@ fn progress_json(event: &wire::Event) -> Value {
         "workers": event.workers,
         "differing_tiles": event.differing_tiles,
         "failure": reason,
+        "left_seconds": event.left.map(|left| left.mean),
+        "left_seconds_error": event.left.map(|left| left.error),
         "obstacle": (!event.obstacle.is_empty()).then_some(&event.obstacle),
     })
+}
+
+fn explain(job: u64, tile: u32, told: &wire::ExplainResponse) -> Answer {
+    let wire::Crop { x, y, width, height } = told.area.unwrap_or_default();
+    let state = match told.state() {
+        wire::TileState::Done => "done",
+        wire::TileState::InWork => "in work",
+        _ => "open",
+    };
+    let tally = told.tally.unwrap_or_default();
+    let hash: String = told.hash.iter().map(|byte| format!("{byte:02x}")).collect();
+    let is_known = !hash.is_empty();
+    let attempts = told.attempts.iter().map(|attempt| {
+        json!({
+            "worker": attempt.worker, "host": attempt.host, "lease": attempt.lease,
+            "seconds_ago": attempt.age, "in_picture": attempt.won,
+            "lost": (!attempt.lost.is_empty()).then_some(&attempt.lost),
+        })
+    });
+    let json = json!({
+        "job": job.to_string(), "tile": tile, "state": state, "area": [x, y, width, height],
+        "worker": (told.worker > 0).then_some(told.worker), "host": told.host,
+        "seconds": is_known.then_some(told.seconds), "rays": is_known.then_some(tally.rays),
+        "samples": is_known.then_some(tally.samples), "hash": is_known.then_some(&hash),
+        "attempts": attempts.collect::<Vec<Value>>(),
+    });
+    let mut text = format!("tile {tile} of job {job}, {width}x{height} at ({x}, {y}): {state}\n");
+    if is_known {
+        let by = match told.worker {
+            0 => "under an earlier start of the coordinator".to_owned(),
+            worker => format!("by worker {worker} on {}", told.host),
+        };
+        let (seconds, rays) = (told.seconds, tally.rays);
+        let _ = writeln!(text, "rendered {by} in {seconds:.3} s, {rays} rays\nhash {hash}");
+    }
+    for attempt in &told.attempts {
+        let end = match (attempt.won, attempt.lost.as_str()) {
+            (true, _) => "is in the picture".to_owned(),
+            (false, "") => "brought nothing yet, or another was earlier".to_owned(),
+            (false, lost) => format!("lost: {lost}"),
+        };
+        let wire::Attempt { worker, host, age, .. } = attempt;
+        let _ = writeln!(text, "{age:.1} s ago to worker {worker} on {host}: {end}");
+    }
+    Answer { json, text }
 }
 
 fn list_workers(workers: &[wire::WorkerEntry]) -> Answer {
@@ -408,6 +461,7 @@ async fn watch_once(
             tiles_done: event.tiles_done,
             tile_count: event.tile_count,
             tally,
+            left: time_left(event.left).map(|[mean, error]| TimeLeft { mean, error }),
             ..Progress::default()
         });
         if event.end.is_some() {

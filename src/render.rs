@@ -2,7 +2,7 @@
 
 use std::{
     collections::VecDeque,
-    io::{self, Write},
+    io::{self, Seek, Write},
     sync::{Arc, Mutex},
     time::Duration,
 };
@@ -16,8 +16,8 @@ use rtfarm_core::{
     tile::Size,
     transfer::Transfer,
 };
-use rtfarm_job::{Order, Outcome, Progress, Refusal};
-use rtfarm_picture::{Canvas, Picture};
+use rtfarm_job::{Order, Outcome, Progress, Provenance, Refusal};
+use rtfarm_picture::{Canvas, Notes};
 use rtfarm_proto::Address;
 use tokio::{
     net::UnixListener,
@@ -152,17 +152,27 @@ struct Rendered {
 }
 
 enum Drawn {
-    Here(Canvas),
+    Here(Canvas, Provenance),
     Job(Arc<Job>),
 }
 
 impl Drawn {
-    fn picture(&self) -> &Picture {
+    /// Writes the picture's file.
+    fn encode(&self, out: impl Write + Seek) -> io::Result<()> {
         match self {
-            Self::Here(canvas) => canvas.picture(),
-            Self::Job(job) => job.picture(),
+            Self::Here(canvas, provenance) => {
+                let provenance = provenance.text(&canvas.tally()?);
+                let software = format!("rtfarm {}", software());
+                canvas.picture().encode(&Notes { software, provenance }, out)
+            }
+            Self::Job(job) => job.picture().encode(&job.notes(&software())?, out),
         }
     }
+}
+
+/// This program's version and build.
+pub(crate) fn software() -> String {
+    format!("{VERSION} ({BUILD})")
 }
 
 /// The command under way.
@@ -286,8 +296,16 @@ impl Render<'_> {
         let (picture, tally, rendering) = match work {
             Work::Here(ordered) => {
                 let (order, begun) = *ordered;
+                let provenance = Provenance {
+                    build: software(),
+                    scene: order.prepared.hash(),
+                    settings: order.settings,
+                    grid: order.grid,
+                    transfer: order.transfer,
+                    format: order.format,
+                };
                 let (canvas, tally, rendering) = self.render_here(order, begun).await?;
-                (Drawn::Here(canvas), tally, rendering)
+                (Drawn::Here(canvas, provenance), tally, rendering)
             }
             Work::Job(job) => {
                 let rendering = wait(&job, self.console).await?;
@@ -306,7 +324,7 @@ impl Render<'_> {
     async fn write(&self, rendered: Rendered) -> Result<(), Failure> {
         let Rendered { summary, output, resume, picture } = rendered;
         let job = match &picture {
-            Drawn::Here(_) => None,
+            Drawn::Here(..) => None,
             Drawn::Job(job) => Some(job.id()),
         };
         write_picture(&output, self.stop, picture).await?;
@@ -400,6 +418,7 @@ impl Render<'_> {
             keeping: Keeping::default(),
             upload_silence: UPLOAD_SILENCE,
             events: None,
+            begins_coarsely: self.args.show,
             host: None,
             scene_folder: folder.path().to_owned(),
             picture_folder: first.output.folder(),
@@ -613,7 +632,7 @@ async fn write_picture(
     drawn: Drawn,
 ) -> Result<(), Failure> {
     let (output, token) = (output.clone(), stop.clone());
-    let written = spawn_blocking(move || output.write(&token, |file| drawn.picture().encode(file)));
+    let written = spawn_blocking(move || output.write(&token, |file| drawn.encode(file)));
     match written.await? {
         Err(_) if stop.is_cancelled() => Err(Failure::Interrupted),
         written => Ok(written?),

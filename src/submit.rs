@@ -8,7 +8,7 @@ use std::{
 };
 
 use rtfarm_client::{Ended, Finished, JobState, Order, Outside, Trouble};
-use rtfarm_job::Progress;
+use rtfarm_job::{Progress, TimeLeft};
 use rtfarm_proto::{
     Access, CHUNK_BYTES, ConnectError, JobId, MESSAGE_BYTES, PROTOCOL, Reached,
     wire::{self, jobs_client::JobsClient, submit_request::Part},
@@ -156,6 +156,7 @@ impl Outside for Here<'_> {
             tiles_done: state.tiles_done,
             tile_count: state.tile_count,
             tally: state.tally,
+            left: state.left.map(|[mean, error]| TimeLeft { mean, error }),
             ..Progress::default()
         });
         tracing::debug!(done = state.tiles_done, count = state.tile_count, "progress");

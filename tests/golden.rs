@@ -76,7 +76,7 @@ fn render(name: &str) -> Vec<u8> {
     let picture = Picture::new(file, size, PictureFormat::Png16, Transfer::None).unwrap();
     picture.put(area, &tile.pixels).unwrap();
     let mut png = Cursor::new(Vec::new());
-    picture.encode(&mut png).unwrap();
+    picture.encode(&rtfarm_picture::Notes::default(), &mut png).unwrap();
     png.into_inner()
 }
 

@@ -295,10 +295,10 @@ fn paths_are_read_with_their_braces() {
 }
 
 /// The coordinator's files, each of which knows earlier ones only.
-const COORDINATOR: [&str; 21] = [
+const COORDINATOR: [&str; 22] = [
     "identity", "tiles", "pace", "lease", "members", "waiting", "audit", "farm", "store", "record",
-    "state", "job", "events", "shell", "live", "accept", "security", "guard", "page", "service",
-    "run",
+    "state", "job", "events", "shell", "live", "metrics", "accept", "security", "guard", "page",
+    "service", "run",
 ];
 
 #[test]
@@ -311,6 +311,7 @@ fn files_of_the_coordinator_know_only_earlier_ones() {
         "restart",
         "whole_farm",
         "farm/tests",
+        "farm/history",
         "farm/queue",
         "farm/trust",
         "farm/watching",

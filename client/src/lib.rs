@@ -7,7 +7,7 @@ mod run;
 mod submission;
 
 pub use plain::plain;
-pub use run::{Order, Outside, is_lost, run};
+pub use run::{Order, Outside, is_lost, run, time_left};
 pub use submission::{
     Ended, FIRST_PAUSE, Finished, JobEnd, JobState, LONGEST_PAUSE, NoPicture, Trouble,
 };

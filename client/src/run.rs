@@ -387,6 +387,14 @@ fn read_submitted(answer: wire::SubmitResponse) -> Result<(Submitted, Bytes), Tr
     Ok((Submitted { outcome, report: plain(&answer.report) }, farm))
 }
 
+/// What a coordinator says of the time that a job will take yet, if that makes sense.
+/// It comes with one standard deviation.
+pub fn time_left(told: Option<wire::TimeLeft>) -> Option<[Duration; 2]> {
+    let wire::TimeLeft { mean, error } = told?;
+    let seconds = |seconds| Duration::try_from_secs_f64(seconds).ok();
+    Some([seconds(mean)?, seconds(error)?])
+}
+
 fn read_event(event: wire::Event) -> Result<JobState, Trouble> {
     let end = match event.end {
         Some(event::End::Finished(finished)) => {
@@ -403,6 +411,7 @@ fn read_event(event: wire::Event) -> Result<JobState, Trouble> {
         worker_count: event.workers,
         differing_tiles: event.differing_tiles,
         obstacle: plain(&event.obstacle),
+        left: time_left(event.left),
         end,
     })
 }

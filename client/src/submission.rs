@@ -70,6 +70,8 @@ pub struct JobState {
     pub differing_tiles: u32,
     /// Why the job does not get further, unless that may change by itself; otherwise empty.
     pub obstacle: String,
+    /// How long it will take yet and one standard deviation of that, if it can be told.
+    pub left: Option<[Duration; 2]>,
     /// How it ended, when it has.
     pub end: Option<JobEnd>,
 }
@@ -505,6 +507,7 @@ mod tests {
             worker_count: 2,
             differing_tiles: 0,
             obstacle,
+            left: None,
             end,
         }
     }

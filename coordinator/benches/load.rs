@@ -87,6 +87,7 @@ async fn run(load: Load, folder: PathBuf) -> Result<(), Error> {
         term: Duration::from_secs(60),
         upload_silence: Duration::from_secs(30),
         events: None,
+        begins_coarsely: false,
         host: None,
         scene_folder: scenes.path().to_owned(),
         picture_folder: folder,

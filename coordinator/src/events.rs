@@ -2,7 +2,7 @@
 //! them for those who watch.
 
 use std::{
-    collections::VecDeque,
+    collections::{BTreeMap, VecDeque},
     fs::File,
     io::{self, Write},
     path::{Path, PathBuf},
@@ -33,7 +33,19 @@ const MOST_WAITING: usize = 1 << 14;
 #[derive(Debug, Default)]
 pub(crate) struct Events {
     kept: Mutex<Kept>,
+    counts: Mutex<Counts>,
     file: Option<EventFile>,
+}
+
+/// What happened so far, counted.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct Counts {
+    /// Tiles that came into pictures, rays that were traced for them, and seconds on one thread.
+    pub(crate) tiles: u64,
+    pub(crate) rays: u64,
+    pub(crate) seconds: f64,
+    /// Other events, by their names.
+    pub(crate) by_name: BTreeMap<&'static str, u64>,
 }
 
 #[derive(Debug, Default)]
@@ -58,7 +70,15 @@ impl Events {
 
     /// Notes what happens. Nobody waits for the file.
     pub(crate) fn on_notice(&self, notice: &Notice) {
-        let is_tile = matches!(notice, Notice::TileDone { .. });
+        let is_tile = if let Notice::TileDone { delivery, .. } = notice {
+            let mut counts = self.counts.lock().expect("nothing here panics");
+            counts.tiles += 1;
+            counts.rays = counts.rays.saturating_add(delivery.tally.rays);
+            counts.seconds += delivery.seconds;
+            true
+        } else {
+            false
+        };
         if is_tile && self.file.is_none() {
             return;
         }
@@ -77,7 +97,16 @@ impl Events {
         self.note("job finished", fields, true);
     }
 
-    fn note(&self, name: &str, fields: Value, is_kept: bool) {
+    /// What happened so far, counted.
+    pub(crate) fn counts(&self) -> Counts {
+        self.counts.lock().expect("nothing here panics").clone()
+    }
+
+    fn note(&self, name: &'static str, fields: Value, is_kept: bool) {
+        if is_kept {
+            let mut counts = self.counts.lock().expect("nothing here panics");
+            *counts.by_name.entry(name).or_default() += 1;
+        }
         let mut event = Map::new();
         event.insert("time".to_owned(), seconds_since_1970().into());
         event.insert("event".to_owned(), name.into());

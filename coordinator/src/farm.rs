@@ -8,7 +8,7 @@ use std::{
 };
 
 use rtfarm_core::{render::Tally, tile::TileId};
-use rtfarm_job::{Outcome, Progress};
+use rtfarm_job::{Outcome, Progress, TileCosts};
 use rtfarm_proto::{Incarnation, JobId, LONGEST_WAIT, LeaseId, LeaseName, Renewal, WorkerId};
 
 use crate::{
@@ -86,6 +86,10 @@ struct JobState {
     storing: BTreeMap<TileId, Storing>,
     /// The tiles in the picture that came since this start, in the order of coming.
     brought: Vec<Delivery>,
+    /// The leases that were given since this start, the earliest first.
+    history: Vec<Given>,
+    /// What the tiles that were brought took.
+    costs: TileCosts,
     /// Tiles of which copies differ, and nobody could say which is right.
     unsettled: BTreeSet<TileId>,
 }
@@ -259,6 +263,8 @@ impl JobState {
             senseless: BTreeMap::new(),
             storing: BTreeMap::new(),
             brought: Vec::new(),
+            history: Vec::new(),
+            costs: TileCosts::default(),
             unsettled: BTreeSet::new(),
         }
     }
@@ -267,7 +273,9 @@ impl JobState {
     fn forget_tallies(&mut self, taken: &BTreeSet<TileId>) {
         self.brought.retain(|delivery| !taken.contains(&delivery.tile));
         self.progress.tally = self.earlier.tally;
+        self.costs = TileCosts::default();
         for delivery in &self.brought {
+            self.costs.add(delivery.seconds);
             self.progress.tally.add(&delivery.tally);
         }
     }
@@ -436,6 +444,7 @@ impl Farm {
     ) {
         for loss in losses {
             let job = loss.lease.job;
+            self.note_lost(&loss, reason);
             for &tile in &loss.again {
                 if self.audit.on_loss(job, tile) {
                     actions.push(Action::Log(Notice::NotCompared(job, tile)));
@@ -489,7 +498,9 @@ impl Farm {
         let grid = self.leases.tiles(job)?.grid();
         let tiles: Vec<TileId> = numbers.iter().filter_map(|&number| grid.tile(number)).collect();
         let threads = self.members.threads(worker).0;
-        self.leases.on_offer((worker, threads), job, &tiles, now)
+        let run = self.leases.on_offer((worker, threads), job, &tiles, now)?;
+        self.note_given(worker, &run, now);
+        Some(run)
     }
 
     /// Event: nobody waits for the answer to a question any longer.
@@ -517,6 +528,7 @@ impl Farm {
                 }
             };
             let run = run.expect("the job has a free tile, or the lease one that is in no other");
+            self.note_given(ask.worker, &run, now);
             actions.push(Action::Answer(id, Ok(Next::Render(run))));
         }
         while let Some((from, id, quiet)) = self.next_second_rendering()
@@ -525,6 +537,7 @@ impl Farm {
         {
             let run = self.leases.on_idle_at_the_end(ask.worker, quiet, now);
             let run = run.expect("a quiet lease holds a tile that no other lease holds");
+            self.note_given(ask.worker, &run, now);
             actions.push(Action::Answer(id, Ok(Next::Render(run))));
         }
         while let Some((until, id)) = self.waiting.next_deadline()
@@ -754,6 +767,9 @@ impl Farm {
         job.progress.tiles_done = done;
         job.progress.tally.add(&delivery.tally);
         job.brought.push(delivery);
+        job.costs.add(delivery.seconds);
+        let left = job.progress.tile_count - done;
+        job.progress.left = job.costs.time_left(left, now.saturating_duration_since(job.started));
         job.progress.worker_count = job.earlier.worker_count.max(job.contributors.len() as u32);
         let (progress, elapsed) = (job.progress.clone(), job.elapsed(now));
         let mut actions = vec![Action::Acknowledge(storing.id, Verdict::Accepted)];
@@ -960,7 +976,7 @@ impl Farm {
             }
             job.rest = Some(tiles);
         }
-        job.progress.outcome = Some(outcome);
+        (job.progress.outcome, job.progress.left) = (Some(outcome), None);
         actions.push(Action::Publish(id, job.progress.clone()));
         for storing in std::mem::take(&mut job.storing).into_values() {
             let copies = storing.copies.into_iter().map(|(id, _)| id);
@@ -1055,10 +1071,13 @@ impl Farm {
     }
 }
 
+mod history;
 mod queue;
 mod trust;
 mod watching;
 
+use history::Given;
+pub(crate) use history::{Attempt, Explanation};
 pub use queue::Keeping;
 pub(crate) use queue::{Change, JobEntry, Phase as JobPhase, Refused, Terms};
 pub(crate) use watching::Arrived;

@@ -1,10 +1,13 @@
 //! What the shell keeps of a job: its scene, its picture, and how far it is for those who watch.
 
-use std::sync::Arc;
+use std::{io, sync::Arc};
 
-use rtfarm_core::{render::Settings, tile::TileGrid};
-use rtfarm_job::Progress;
-use rtfarm_picture::{Canvas, Picture};
+use rtfarm_core::{
+    render::{Quality, Sampling, Settings},
+    tile::{Crop, Size, TileGrid},
+};
+use rtfarm_job::{Progress, Provenance};
+use rtfarm_picture::{Canvas, Notes, Picture, PictureFormat};
 use rtfarm_proto::{JobId, TileHasher};
 use tokio::sync::watch;
 
@@ -28,6 +31,8 @@ pub struct Job {
     pub(crate) canvas: Canvas,
     /// Where it outlives this process.
     pub(crate) folder: Option<JobFolder>,
+    /// Another build began it.
+    pub(crate) is_foreign: bool,
     pub(crate) progress: watch::Sender<Progress>,
 }
 
@@ -39,13 +44,24 @@ impl Job {
         plan: &Plan,
         scene: SceneFile,
         canvas: Canvas,
-        folder: Option<JobFolder>,
+        (folder, is_foreign): (Option<JobFolder>, bool),
     ) -> Arc<Self> {
         let &Plan { settings, grid, .. } = plan;
         let hasher = TileHasher::new(id, scene.hash(), settings, grid);
         let progress = Progress { tile_count: grid.count(), ..Progress::default() };
         let progress = watch::Sender::new(progress);
-        Arc::new(Self { id, ticket, scene, settings, grid, hasher, canvas, folder, progress })
+        Arc::new(Self {
+            id,
+            ticket,
+            scene,
+            settings,
+            grid,
+            hasher,
+            canvas,
+            folder,
+            is_foreign,
+            progress,
+        })
     }
 
     /// Its number.
@@ -56,6 +72,46 @@ impl Job {
     /// Its picture, complete once the job has finished.
     pub fn picture(&self) -> &Picture {
         self.canvas.picture()
+    }
+
+    /// What a coarse picture of the same renders, with one sample for each of some thousand pixels;
+    /// `None` when this one is hardly finer.
+    pub(crate) fn coarse(&self) -> Option<Plan> {
+        const MOST_PIXELS: u64 = 1 << 15;
+        let (window, quality) = (self.grid.window(), self.settings.quality);
+        let step = |step: &u32| window.size().pixel_count() / u64::from(step * step) <= MOST_PIXELS;
+        let step = (0..16).map(|power| 1 << power).find(step).filter(|step| *step > 1)?;
+        let frame = self.settings.size;
+        let side = |side: u32| u64::from(side.div_ceil(step));
+        let size = Size::new(side(frame.width()), side(frame.height())).ok()?;
+        let sides = [window.width(), window.height()].map(|side| (side / step).max(1));
+        let window = Crop { corner: [window.x0(), window.y0()].map(|place| place / step), sides };
+        Some(Plan {
+            scene: self.scene.hash(),
+            scene_byte_count: self.scene.byte_count(),
+            settings: Settings {
+                size,
+                quality: Quality { sampling: Sampling::fixed(1)?, ..quality },
+            },
+            grid: TileGrid::new(window.of(size).ok()?, 32).ok()?,
+            format: PictureFormat::Png8,
+            transfer: self.picture().transfer(),
+        })
+    }
+
+    /// What its picture's file says of it, rendered by `software` (a version and a build).
+    pub fn notes(&self, software: &str) -> io::Result<Notes> {
+        let build = if self.is_foreign { "another" } else { software };
+        let provenance = Provenance {
+            build: build.to_owned(),
+            scene: self.scene.hash(),
+            settings: self.settings,
+            grid: self.grid,
+            transfer: self.picture().transfer(),
+            format: self.picture().format(),
+        };
+        let provenance = provenance.text(&self.canvas.tally()?);
+        Ok(Notes { software: format!("rtfarm {build}"), provenance })
     }
 
     /// How far it is, now and later.

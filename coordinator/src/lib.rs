@@ -9,7 +9,7 @@
 //!
 //! ```text
 //! identity, tiles, pace <- lease, members, waiting, audit <- farm, store, record <- state <- job
-//! farm <- events; events, job <- shell <- live <- page; shell <- service <- run
+//! farm <- events; events, job <- shell <- live, metrics <- page; shell <- service <- run
 //! security, accept <- guard, page <- service; accept <- run
 //! ```
 
@@ -25,6 +25,7 @@ mod live;
 #[cfg(test)]
 mod load;
 mod members;
+mod metrics;
 mod pace;
 mod page;
 mod record;

@@ -43,6 +43,9 @@ const MOST_BYTES: usize = 1 << 23;
 /// All that there is to know is made anew after so long, if there is more by then.
 const FRESH: Duration = Duration::from_secs(1);
 
+/// A coarse picture that has not come after so long is of no use.
+const COARSE_PATIENCE: Duration = Duration::from_secs(60);
+
 /// The most tiles in work that are told.
 const MOST_IN_WORK: usize = 2000;
 
@@ -66,6 +69,8 @@ pub(crate) struct Feed {
     job: Option<Arc<Job>>,
     told: Mutex<Told>,
     whole: Mutex<Option<Whole>>,
+    /// A coarse picture, as a PNG in base 64, once there is one.
+    coarse: Mutex<Option<String>>,
     /// The number of the last message.
     news: watch::Sender<u64>,
 }
@@ -119,10 +124,11 @@ impl Live {
         feeds.by_job.retain(|_, feed| feed.strong_count() > 0);
         feeds.count += 1;
         let number = shell.identity.incarnation.0.wrapping_add(feeds.count);
-        let (told, whole) = Default::default();
-        let feed = Arc::new(Feed { number, job, told, whole, news: watch::Sender::new(0) });
+        let (told, whole, coarse) = Default::default();
+        let feed = Arc::new(Feed { number, job, told, whole, coarse, news: watch::Sender::new(0) });
         feeds.by_job.insert(id, Arc::downgrade(&feed));
         tokio::spawn(keep_told(Arc::clone(shell), Arc::clone(&feed)));
+        tokio::spawn(show_coarse(Arc::clone(shell), Arc::clone(&feed)));
         feed
     }
 }
@@ -140,6 +146,39 @@ async fn keep_told(shell: Arc<Shell>, feed: Arc<Feed>) {
         tokio::time::sleep(PERIOD).await;
         idle = if Arc::strong_count(&feed) > 1 { 0 } else { idle + 1 };
         period += 1;
+    }
+}
+
+/// Has a coarse picture rendered of one that is hardly begun, and shows it.
+async fn show_coarse(shell: Arc<Shell>, feed: Arc<Feed>) {
+    let Some(job) = feed.job.clone() else { return };
+    let is_early = {
+        let progress = job.progress.borrow();
+        progress.outcome.is_none() && progress.tiles_done <= progress.tile_count / 10
+    };
+    if !is_early {
+        return;
+    }
+    let making = tokio::task::spawn_blocking(move || shell.coarse(&job));
+    let Ok(Some(coarse)) = making.await else { return };
+    let mut progress = coarse.progress();
+    let ended = progress.wait_for(|progress| progress.outcome.is_some());
+    let is_finished = match tokio::time::timeout(COARSE_PATIENCE, ended).await {
+        Ok(Ok(progress)) => matches!(progress.outcome, Some(Outcome::Finished(_))),
+        _ => false,
+    };
+    if !is_finished {
+        return;
+    }
+    let window = coarse.grid.window();
+    let encode = move || View::of(window).encode(coarse.picture(), &[window]);
+    if let Ok(Ok(png)) = tokio::task::spawn_blocking(encode).await {
+        let png = BASE64_STANDARD.encode(png);
+        let data = json!({ "png": png }).to_string();
+        *feed.coarse.lock().expect("nothing here panics") = Some(png);
+        let mut told = feed.told();
+        feed.push(&mut told, "coarse", &data);
+        feed.news.send_replace(told.last);
     }
 }
 
@@ -179,7 +218,7 @@ impl Feed {
         if !is_known {
             let mut messages = Vec::new();
             if let Some(job) = &self.job {
-                messages.push(self.message(last, "picture", &whole_picture(shell, job)?));
+                messages.push(self.message(last, "picture", &self.whole_picture(shell, job)?));
             }
             let status = status(shell, self.job.as_deref());
             messages.push(self.message(last, "status", &status.to_string()));
@@ -189,6 +228,30 @@ impl Feed {
         }
         let Whole { last, messages, .. } = whole.as_ref().expect("it was made");
         Ok((Seen { feed: self.number, message: *last }, messages.clone()))
+    }
+
+    /// A picture as it is: how it is cut, which tiles are in it, and what a view shows of it.
+    fn whole_picture(&self, shell: &Shell, job: &Job) -> io::Result<String> {
+        let grid: TileGrid = job.grid;
+        let window = grid.window();
+        // First which, then what they look like: what comes meanwhile is told again.
+        let done = shell.done(job.id);
+        let view = View::of(window);
+        let png = view.encode(job.picture(), &[window])?;
+        let mut bits = vec![0; grid.count().div_ceil(8) as usize];
+        for (number, _) in done.iter().flatten().enumerate().filter(|(_, is_done)| **is_done) {
+            bits[number / 8] |= 1 << (number % 8);
+        }
+        Ok(json!({
+        "job": job.id.0.to_string(), "name": job.ticket.name,
+        "width": window.width(), "height": window.height(), "x0": window.x0(), "y0": window.y0(),
+        "step": view.step(), "viewWidth": view.size().width(), "viewHeight": view.size().height(),
+        "side": grid.side(), "columns": grid.columns(), "count": grid.count(),
+        "exact": view.step() == 1 && job.picture().format() == PictureFormat::Png8,
+        "done": done.map(|_| BASE64_STANDARD.encode(bits)), "png": BASE64_STANDARD.encode(png),
+        "coarse": *self.coarse.lock().expect("nothing here panics"),
+    })
+    .to_string())
     }
 
     fn message(&self, number: u64, name: &str, data: &str) -> Bytes {
@@ -264,29 +327,6 @@ fn new_tiles(job: &Job, tiles: &[(TileId, WorkerId)]) -> io::Result<String> {
     Ok(json!({ "tiles": numbers, "png": BASE64_STANDARD.encode(png) }).to_string())
 }
 
-/// A picture as it is: how it is cut, which tiles are in it, and what a view shows of it.
-fn whole_picture(shell: &Shell, job: &Job) -> io::Result<String> {
-    let grid: TileGrid = job.grid;
-    let window = grid.window();
-    // First which, then what they look like: what comes meanwhile is told again.
-    let done = shell.done(job.id);
-    let view = View::of(window);
-    let png = view.encode(job.picture(), &[window])?;
-    let mut bits = vec![0; grid.count().div_ceil(8) as usize];
-    for (number, _) in done.iter().flatten().enumerate().filter(|(_, is_done)| **is_done) {
-        bits[number / 8] |= 1 << (number % 8);
-    }
-    Ok(json!({
-        "job": job.id.0.to_string(), "name": job.ticket.name,
-        "width": window.width(), "height": window.height(), "x0": window.x0(), "y0": window.y0(),
-        "step": view.step(), "viewWidth": view.size().width(), "viewHeight": view.size().height(),
-        "side": grid.side(), "columns": grid.columns(), "count": grid.count(),
-        "exact": view.step() == 1 && job.picture().format() == PictureFormat::Png8,
-        "done": done.map(|_| BASE64_STANDARD.encode(bits)), "png": BASE64_STANDARD.encode(png),
-    })
-    .to_string())
-}
-
 /// Jobs, workers, and which tiles of a job are in work.
 fn status(shell: &Shell, job: Option<&Job>) -> Value {
     let jobs: Vec<Value> = shell.jobs().iter().map(|(entry, job)| job_status(entry, job)).collect();
@@ -318,6 +358,8 @@ fn job_status(entry: &JobEntry, job: &Job) -> Value {
         "job": id.0.to_string(), "name": job.ticket.name, "owner": job.ticket.owner, "state": state,
         "priority": terms.priority, "workers": workers_now, "reason": reason,
         "done": progress.tiles_done, "count": progress.tile_count, "rays": progress.tally.rays,
+        "left": progress.left.map(|left| left.mean.as_secs_f64()),
+        "leftError": progress.left.map(|left| left.error.as_secs_f64()),
         "error": progress.tally.error(), "seconds": (elapsed.as_secs_f64() * 10.0).round() / 10.0,
         "width": size.width(), "height": size.height(),
     })

@@ -245,6 +245,11 @@ impl Members {
         (self.by_id.get(&worker).map_or(0, |member| member.process.threads), self.threads)
     }
 
+    /// What a member's machine is called.
+    pub(crate) fn host(&self, worker: WorkerId) -> Option<&str> {
+        self.by_id.get(&worker).map(|member| member.process.host.as_str())
+    }
+
     /// The first member that runs in the process with that number.
     pub(crate) fn in_process(&self, process: u32) -> Option<WorkerId> {
         let of_process = (process, WorkerId(0))..=(process, WorkerId(u32::MAX));

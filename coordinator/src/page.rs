@@ -38,6 +38,7 @@ use crate::{
     accept::Peer,
     job::Job,
     live::{Feed, Live, Seen, keep_alive},
+    metrics,
     security::Security,
     shell::Shell,
 };
@@ -123,6 +124,10 @@ impl Page {
         let answer = match path {
             "/page/events" => self.events(&parts).await,
             "/page/pixel" => self.pixel(&parts).await,
+            "/metrics" => {
+                let body = Body::new(Full::new(Bytes::from(metrics::text(&self.shell))));
+                Ok(response(StatusCode::OK, "text/plain; version=0.0.4; charset=utf-8", body))
+            }
             _ => Err((StatusCode::NOT_FOUND, "there is nothing here")),
         };
         answer.unwrap_or_else(|(status, reason)| refused(status, reason))
@@ -321,6 +326,7 @@ mod tests {
             keeping: crate::farm::Keeping::default(),
             upload_silence: Duration::from_secs(1),
             events: None,
+            begins_coarsely: false,
             host: Some("farm.example".to_owned()),
             scene_folder: folder.to_owned(),
             picture_folder: folder.to_owned(),
@@ -335,7 +341,7 @@ mod tests {
         let address = "https://farm.example:7878".parse().unwrap();
         let security = Arc::new(Security::open(state.path(), &address).unwrap());
         let page = page(state.path(), Keeper::Farm(security));
-        for path in ["/page/events", "/page/pixel?job=1&x=0&y=0"] {
+        for path in ["/page/events", "/metrics", "/page/pixel?job=1&x=0&y=0"] {
             for (role, expected) in [("read", 200), ("submit", 200), ("admin", 200), ("work", 403)]
             {
                 let text = std::fs::read_to_string(state.path().join("access").join(role)).unwrap();
@@ -354,6 +360,48 @@ mod tests {
             assert_eq!(ask(&page, open, "farm.example", None).await.status(), StatusCode::OK);
         }
         assert_eq!(ask(&page, "/page/x", "farm.example", None).await.status().as_u16(), 401);
+    }
+
+    #[tokio::test]
+    async fn metrics_are_those_of_prometheus() {
+        let folder = tempfile::tempdir().unwrap();
+        let page = page(folder.path(), Keeper::Nobody);
+        page.shell.events.on_job(JobId(7), "scene");
+        let response = ask(&page, "/metrics", "localhost", None).await;
+        let kind = response.headers()["content-type"].to_str().unwrap();
+        assert!(kind.starts_with("text/plain; version=0.0.4"), "{kind}");
+        let body = http_body_util::BodyExt::collect(response.into_body()).await.unwrap();
+        let text = String::from_utf8(body.to_bytes().to_vec()).unwrap();
+        let mut families = std::collections::BTreeMap::new();
+        for line in text.lines() {
+            if let Some(help) = line.strip_prefix("# HELP ") {
+                let (name, help) = help.split_once(' ').unwrap();
+                assert!(!help.is_empty() && families.insert(name.to_owned(), "").is_none());
+            } else if let Some(kind) = line.strip_prefix("# TYPE ") {
+                let (name, kind) = kind.split_once(' ').unwrap();
+                assert!(families.contains_key(name), "{name}");
+                assert_eq!(name.ends_with("_total"), kind == "counter", "{name}");
+            } else {
+                let (sample, value) = line.rsplit_once(' ').unwrap();
+                let name = sample.split('{').next().unwrap();
+                assert!(families.contains_key(name) && value.parse::<f64>().is_ok(), "{line}");
+            }
+        }
+        assert!(text.contains("rtfarm_events_total{event=\"job started\"} 1\n"), "{text}");
+        assert!(text.contains("rtfarm_jobs{state=\"rendering\"} 0\n"), "{text}");
+        // Where there is Prometheus, it has the last word.
+        let promtool = std::process::Command::new("promtool")
+            .args(["check", "metrics"])
+            .stdin(std::process::Stdio::piped())
+            .stdout(std::process::Stdio::piped())
+            .stderr(std::process::Stdio::piped())
+            .spawn();
+        let Ok(mut promtool) = promtool else { return eprintln!("there is no promtool") };
+        let mut input = promtool.stdin.take().unwrap();
+        io::Write::write_all(&mut input, text.as_bytes()).unwrap();
+        drop(input);
+        let output = promtool.wait_with_output().unwrap();
+        assert!(output.status.success() && output.stderr.is_empty(), "{output:?}");
     }
 
     #[tokio::test]

@@ -228,6 +228,10 @@ pub(crate) fn to_event(progress: &Progress) -> wire::Event {
         workers: progress.worker_count,
         differing_tiles: progress.differing_tiles,
         obstacle: progress.obstacle.clone().unwrap_or_default(),
+        left: progress.left.map(|left| wire::TimeLeft {
+            mean: left.mean.as_secs_f64(),
+            error: left.error.as_secs_f64(),
+        }),
         end: progress.outcome.as_ref().map(|outcome| match outcome {
             Outcome::Finished(time) => {
                 event::End::Finished(wire::Finished { seconds: time.as_secs_f64() })

@@ -78,6 +78,7 @@ impl Coordinator {
             term: Duration::from_secs(4),
             upload_silence: Duration::from_secs(4),
             events: None,
+            begins_coarsely: false,
             host: None,
             scene_folder: PathBuf::new(),
             picture_folder: PathBuf::new(),
@@ -128,7 +129,7 @@ impl Coordinator {
 
 fn encode(job: &Job) -> Vec<u8> {
     let mut out = Cursor::new(Vec::new());
-    job.picture().encode(&mut out).unwrap();
+    job.picture().encode(&rtfarm_picture::Notes::default(), &mut out).unwrap();
     out.into_inner()
 }
 

@@ -69,8 +69,11 @@ impl Role {
 
     /// Says whether who has this role may call that method, by its path.
     fn may(self, path: &str) -> bool {
-        let Some((service, method)) = path.trim_start_matches('/').split_once('/') else {
-            return false;
+        let path = path.trim_start_matches('/');
+        let (service, method) = match path.split_once('/') {
+            Some(named) => named,
+            None if path == "metrics" => ("page", path),
+            None => return false,
         };
         let reads = matches!(method, "List" | "Workers" | "Watch" | "Image" | "Explain");
         match (self, service) {
@@ -156,8 +159,12 @@ impl Security {
         }
         let is_new = !folder.join(TOKENS).exists();
         let mut tokens = if is_new { Tokens::default() } else { Tokens::read(&folder)? };
-        tokens.address = address.to_string();
-        tokens.write(&folder)?;
+        // A folder that others look after, such as a secret of Kubernetes, is not written to.
+        let address_text = address.to_string();
+        if tokens.address != address_text {
+            tokens.address = address_text;
+            tokens.write(&folder)?;
+        }
         for role in Role::ALL {
             if is_new {
                 renew_in(&folder, role)?;
@@ -337,6 +344,8 @@ fn write(path: &Path, text: &str) -> Result<(), SecurityError> {
 
 #[cfg(test)]
 mod tests {
+    use std::collections::BTreeMap;
+
     use super::*;
 
     fn address() -> Address {
@@ -401,6 +410,25 @@ mod tests {
         assert_eq!(worker.address(), &elsewhere);
         assert_eq!(check(&again, "/rtfarm.v1.Farm/Join", worker.token().unwrap()), None);
         assert!(!state.path().join("access/submit").exists());
+    }
+
+    #[test]
+    fn a_folder_that_needs_no_change_is_left_alone() {
+        let state = tempfile::tempdir().unwrap();
+        Security::open(state.path(), &address()).unwrap();
+        let files = || -> BTreeMap<PathBuf, u64> {
+            let files = fs::read_dir(state.path().join(FOLDER)).unwrap().map(Result::unwrap);
+            files.map(|file| (file.path(), file.metadata().unwrap().ino())).collect()
+        };
+        // A coordinator needs neither the authority's key nor the access files.
+        for needless in ["authority", "submit", "work", "read", "admin"] {
+            fs::remove_file(state.path().join(FOLDER).join(needless)).unwrap();
+        }
+        let before = files();
+        assert_eq!(before.len(), 2);
+        let security = Security::open(state.path(), &address()).unwrap();
+        assert_eq!(files(), before);
+        security.tls(Duration::from_secs(5)).unwrap();
     }
 
     #[test]

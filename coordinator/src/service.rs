@@ -12,10 +12,10 @@ use std::{
 use rtfarm_core::{
     language::{Style, draw_diagnostics},
     render::Tally,
-    tile::{Crop, Size},
+    tile::{Crop, Size, TileId},
 };
 use rtfarm_job::{Outcome, Placed, Refusal, RenderRequest};
-use rtfarm_picture::TilePixels;
+use rtfarm_picture::{TilePixels, TileRecord};
 use rtfarm_proto::{
     CHUNK_BYTES, JobId, LONGEST_WAIT, LeaseName, MESSAGE_BYTES, PROTOCOL, Renewal, WireError,
     WorkerId, scene_hash, transfer,
@@ -36,7 +36,7 @@ use tonic::{
 
 use crate::{
     accept::Peer,
-    farm::{Change, Delivery, JobEntry, JobPhase, Next, Refused, Verdict},
+    farm::{Attempt, Change, Delivery, Explanation, JobEntry, JobPhase, Next, Refused, Verdict},
     guard::Guarded,
     identity::Stranger,
     job::Job,
@@ -55,6 +55,9 @@ const LONGEST_BUNDLE: usize = 1 << 31;
 /// A watching client hears of changes no more often than this.
 const WATCH_PERIOD: Duration = Duration::from_millis(50);
 
+/// Whether there are workers at all is looked at so often.
+const WORKERS_PERIOD: Duration = Duration::from_secs(1);
+
 type Chunks = Pin<Box<dyn Stream<Item = Result<wire::Chunk, Status>> + Send>>;
 type Events = Pin<Box<dyn Stream<Item = Result<wire::Event, Status>> + Send>>;
 
@@ -68,9 +71,13 @@ pub(crate) fn router(
     // A frame of a delivery; each costs both sides a call of the system.
     const FRAME_BYTES: u32 = 1 << 17;
     let (farm, jobs) = services(shell);
+    // Who asks for it may have no token: it says that the coordinator serves, and no more.
+    let (reporter, health) = tonic_health::server::health_reporter();
+    drop(reporter);
     let keeper = security.clone().map_or(Keeper::Nobody, Keeper::Farm);
     let routes = Routes::new(Guarded::new(farm, security.clone()))
         .add_service(Guarded::new(jobs, security))
+        .add_service(health)
         .into_axum_router()
         .fallback_service(Page::new(shell, keeper));
     let server = match tls {
@@ -336,18 +343,27 @@ impl jobs_server::Jobs for JobsService {
         let job = self.job(job, &farm)?;
         let mut progress = job.progress();
         let (send, receive) = mpsc::channel(1);
+        let shell = Arc::clone(&self.shell);
         tokio::spawn(async move {
             loop {
-                let event = to_event(&progress.borrow_and_update());
+                let mut event = to_event(&progress.borrow_and_update());
+                let lacks_workers = shell.lacks_workers();
+                add_lack(&mut event, lacks_workers);
                 let is_last = event.end.is_some();
                 if send.send(Ok(event)).await.is_err() || is_last {
                     return;
                 }
                 tokio::time::sleep(WATCH_PERIOD).await;
+                let other_workers = async {
+                    while shell.lacks_workers() == lacks_workers {
+                        tokio::time::sleep(WORKERS_PERIOD).await;
+                    }
+                };
                 tokio::select! {
                     biased;
                     changed = progress.changed() => if changed.is_err() { return },
                     () = send.closed() => return,
+                    () = other_workers => {}
                 }
             }
         });
@@ -366,12 +382,15 @@ impl jobs_server::Jobs for JobsService {
             return Err(Status::failed_precondition("the job has not finished"));
         }
         let folder = self.shell.config.picture_folder.clone();
+        let Config { version, build, .. } = &self.shell.config;
+        let software = format!("{version} ({build})");
         let encoded = blocking({
             let job = Arc::clone(&job);
             move || {
                 let encode = || {
+                    let notes = job.notes(&software)?;
                     let mut file = BufWriter::new(tempfile::tempfile_in(folder)?);
-                    job.picture().encode(&mut file)?;
+                    job.picture().encode(&notes, &mut file)?;
                     let mut file = file.into_inner().map_err(io::IntoInnerError::into_error)?;
                     file.rewind()?;
                     Ok(file)
@@ -398,7 +417,12 @@ impl jobs_server::Jobs for JobsService {
         _: Request<wire::ListRequest>,
     ) -> Result<Response<wire::ListResponse>, Status> {
         let jobs = self.shell.jobs();
-        let jobs = jobs.iter().map(|(entry, job)| to_job_entry(entry, job)).collect();
+        let mut jobs: Vec<wire::JobEntry> =
+            jobs.iter().map(|(entry, job)| to_job_entry(entry, job)).collect();
+        let lacks_workers = self.shell.lacks_workers();
+        for event in jobs.iter_mut().filter_map(|job| job.progress.as_mut()) {
+            add_lack(event, lacks_workers);
+        }
         Ok(Response::new(wire::ListResponse { jobs }))
     }
 
@@ -431,6 +455,26 @@ impl jobs_server::Jobs for JobsService {
     ) -> Result<Response<wire::WorkersResponse>, Status> {
         let workers = self.shell.workers().into_iter().map(to_worker_entry).collect();
         Ok(Response::new(wire::WorkersResponse { workers }))
+    }
+
+    async fn explain(
+        &self,
+        request: Request<wire::ExplainRequest>,
+    ) -> Result<Response<wire::ExplainResponse>, Status> {
+        let wire::ExplainRequest { job, farm, tile } = request.into_inner();
+        let job = self.job(job, &farm)?;
+        let tile = job.grid.tile(tile).ok_or_else(|| {
+            Status::not_found(format!("the job has the tiles 0 to {}", job.grid.count() - 1))
+        })?;
+        let known = self.shell.explain(job.id, tile);
+        let known = known.ok_or_else(|| Status::not_found("there is no such job"))?;
+        // What an earlier start took stands with the picture.
+        let record = blocking({
+            let job = Arc::clone(&job);
+            move || job.canvas.record(tile).map_err(|error| broken(&error))
+        })
+        .await?;
+        Ok(Response::new(to_explanation(&job, tile, known, record)))
     }
 
     async fn station(
@@ -484,6 +528,13 @@ fn accepted(job: &Job, shell: &Shell) -> wire::SubmitResponse {
     wire::SubmitResponse { outcome, report: String::new() }
 }
 
+/// Says of a job that has not ended whether it waits for workers.
+fn add_lack(event: &mut wire::Event, lacks_workers: bool) {
+    if lacks_workers && event.end.is_none() && event.obstacle.is_empty() {
+        "the farm has no worker".clone_into(&mut event.obstacle);
+    }
+}
+
 fn to_job_entry(entry: &JobEntry, job: &Job) -> wire::JobEntry {
     let JobEntry { id, phase, terms, workers_now, progress, elapsed, expires_in } = entry;
     let state = match phase {
@@ -523,6 +574,47 @@ fn to_worker_entry((entry, tiles_leased): (MemberEntry, usize)) -> wire::WorkerE
         tiles_leased: tiles_leased as u32,
         tiles_done,
         silence: silence.as_secs_f64(),
+    }
+}
+
+fn to_explanation(
+    job: &Job,
+    tile: TileId,
+    known: Explanation,
+    record: Option<TileRecord>,
+) -> wire::ExplainResponse {
+    let Explanation { is_done, is_in_work, brought, attempts } = known;
+    let state = match (is_done, is_in_work) {
+        (true, _) => wire::TileState::Done,
+        (_, true) => wire::TileState::InWork,
+        _ => wire::TileState::Open,
+    };
+    let won = brought.filter(|_| is_done).map(|delivery| delivery.lease.id);
+    let taken = match (brought, record) {
+        (Some(Delivery { hash, seconds, tally, .. }), _) => Some((hash, seconds, tally)),
+        (_, Some(record)) => Some((record.arrived, record.seconds.into(), record.tally)),
+        _ => None,
+    };
+    let taken = taken.filter(|_| is_done);
+    let to_attempt = |attempt: &Attempt| wire::Attempt {
+        worker: attempt.worker.0,
+        host: attempt.host.clone(),
+        age: attempt.age.as_secs_f64(),
+        lost: attempt.lost.clone().unwrap_or_default(),
+        lease: attempt.lease.0,
+        won: Some(attempt.lease) == won,
+    };
+    let attempts: Vec<wire::Attempt> = attempts.iter().map(to_attempt).collect();
+    let host = attempts.iter().find(|attempt| attempt.won).map(|attempt| attempt.host.clone());
+    wire::ExplainResponse {
+        state: state.into(),
+        area: Some(Crop::from(job.grid.area(tile)).into()),
+        worker: brought.filter(|_| is_done).map_or(0, |delivery| delivery.worker.0),
+        host: host.unwrap_or_default(),
+        hash: taken.map_or_else(Vec::new, |(hash, ..)| hash.to_vec()).into(),
+        seconds: taken.map_or(0.0, |(_, seconds, _)| seconds),
+        tally: taken.map(|(.., tally)| tally.into()),
+        attempts,
     }
 }
 

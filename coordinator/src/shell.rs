@@ -2,7 +2,7 @@
 //! Nothing is decided here.
 
 use std::{
-    collections::{BTreeMap, HashMap},
+    collections::{BTreeMap, BTreeSet, HashMap},
     future::pending,
     io,
     path::PathBuf,
@@ -24,8 +24,8 @@ use crate::{
     audit::Audit,
     events::Events,
     farm::{
-        Action, Arrived, Change, Delivery, DeliveryId, Earlier, Farm, JobEntry, Keeping, Next,
-        Notice, Refused, Terms, Verdict,
+        Action, Arrived, Change, Delivery, DeliveryId, Earlier, Explanation, Farm, JobEntry,
+        Keeping, Next, Notice, Refused, Terms, Verdict,
     },
     identity::{Identity, Stranger},
     job::Job,
@@ -55,6 +55,8 @@ pub struct Config {
     pub audit: f64,
     /// How long jobs that have ended are kept.
     pub keeping: Keeping,
+    /// A job that begins has a coarse picture rendered first, for those who watch.
+    pub begins_coarsely: bool,
     /// The name by which others know this machine: the page is shown under no other.
     pub host: Option<String>,
     /// A client that sends nothing of its scene for this long is given up.
@@ -118,6 +120,8 @@ struct State {
     farm: Farm,
     /// Jobs that the machine has not forgotten.
     jobs: BTreeMap<JobId, Arc<Job>>,
+    /// Those that render coarse pictures of what others do.
+    coarse: BTreeSet<JobId>,
     /// Questions that the machine has not answered.
     asks: HashMap<AskId, oneshot::Sender<Result<Next, NoMember>>>,
     /// What workers brought and the machine has not answered, by the number of its first tile.
@@ -201,6 +205,7 @@ impl Shell {
         let state = State {
             farm,
             jobs: BTreeMap::new(),
+            coarse: BTreeSet::new(),
             asks: HashMap::new(),
             batches: BTreeMap::new(),
             last_number: 0,
@@ -554,7 +559,7 @@ impl Shell {
         let same = same.as_ref().map(|job| job.scene.path());
         let kept = folder.create_job(id, (&ticket, &plan), &prepared, same);
         let (scene, canvas, folder) = kept.map_err(SubmitError::State)?;
-        let job = Job::new(id, ticket, &plan, scene, canvas, Some(folder));
+        let job = Job::new(id, ticket, &plan, scene, canvas, (Some(folder), false));
         self.begin(&job, Tiles::new(grid), Earlier::default(), false);
         Ok(job)
     }
@@ -597,10 +602,34 @@ impl Shell {
         drop(prepared);
         let (hash, scene_byte_count) = (scene.hash(), scene.byte_count());
         let plan = Plan { scene: hash, scene_byte_count, settings, grid, format, transfer };
-        let job = Job::new(id, ticket, &plan, scene, canvas, None);
+        let job = Job::new(id, ticket, &plan, scene, canvas, (None, false));
         let (tiles, earlier) = progress_of(grid, done);
+        if self.config.begins_coarsely && !tiles.is_over() {
+            self.coarse(&job);
+        }
         self.begin(&job, tiles, earlier, false);
         Ok(job)
+    }
+
+    /// The job of a coarse picture of what another job renders, before all others: it is made when
+    /// there is none. Nobody is told of it but those who watch. This writes a file: never call it on
+    /// the async runtime.
+    pub(crate) fn coarse(&self, of: &Arc<Job>) -> Option<Arc<Job>> {
+        let id = coarse_id(of.id);
+        if let Some(known) = self.job(id) {
+            return Some(known);
+        }
+        let plan = of.coarse()?;
+        let Plan { scene, scene_byte_count, grid, format, transfer, .. } = plan;
+        let canvas = Canvas::new_in(&self.config.picture_folder, grid, format, transfer).ok()?;
+        // The file is that of the other job.
+        let scene = SceneFile::kept(of.scene.path().to_owned(), scene, scene_byte_count);
+        let name = format!("{}, coarse", of.ticket.name);
+        let ticket = Ticket { name, priority: i32::MAX, ..Ticket::default() };
+        let job = Job::new(id, ticket, &plan, scene, canvas, (None, false));
+        self.state().coarse.insert(id);
+        self.begin(&job, Tiles::new(grid), Earlier::default(), false);
+        Some(job)
     }
 
     fn begin(&self, job: &Arc<Job>, tiles: Tiles, earlier: Earlier, is_paused: bool) {
@@ -628,7 +657,7 @@ impl Shell {
     fn take_up(&self, kept: KeptJob) {
         let KeptJob { id, ticket, is_paused, is_foreign, plan, scene, canvas, done, end, folder } =
             kept;
-        let job = Job::new(id, ticket, &plan, scene, canvas, Some(folder));
+        let job = Job::new(id, ticket, &plan, scene, canvas, (Some(folder), is_foreign));
         if let Some((end, age)) = end {
             let terms = terms_of(&job, is_paused, is_foreign);
             // Who watches is not told of its end as of news.
@@ -645,6 +674,9 @@ impl Shell {
 
     /// Ends and forgets a job; says whether it was known.
     pub(crate) fn cancel(&self, job: JobId) -> bool {
+        if self.state().coarse.remove(&coarse_id(job)) {
+            self.tell_farm(|farm, now| farm.on_cancel(coarse_id(job), now));
+        }
         self.tell(|state, now| (state.jobs.contains_key(&job), state.farm.on_cancel(job, now)))
     }
 
@@ -667,6 +699,9 @@ impl Shell {
         self.tell(|state, now| {
             let entries = state.farm.job_entries(now).into_iter();
             let known = |entry: JobEntry| {
+                if state.coarse.contains(&entry.id) {
+                    return None;
+                }
                 let job = state.jobs.get(&entry.id).cloned()?;
                 Some((entry, job))
             };
@@ -694,6 +729,16 @@ impl Shell {
         self.state().farm.in_work(job)
     }
 
+    /// Says whether nobody is there to render.
+    pub(crate) fn lacks_workers(&self) -> bool {
+        self.state().farm.lacks_workers()
+    }
+
+    /// What became of a tile.
+    pub(crate) fn explain(&self, job: JobId, tile: TileId) -> Option<Explanation> {
+        self.tell(|state, now| (state.farm.explain(job, tile, now), Vec::new()))
+    }
+
     /// Decides what a worker gets.
     pub(crate) fn station(&self, worker: WorkerId, standing: Standing) -> Result<(), NoMember> {
         self.tell(|state, now| state.farm.on_station(worker, standing, now))
@@ -716,6 +761,11 @@ impl Shell {
     pub(crate) fn job_with_scene(&self, hash: SceneHash) -> Option<Arc<Job>> {
         self.state().jobs.values().find(|job| job.scene.hash() == hash).cloned()
     }
+}
+
+/// The number of the coarse picture of what a job renders; no other job comes to have it.
+fn coarse_id(of: JobId) -> JobId {
+    JobId(!of.0)
 }
 
 /// What the machine knows of a job besides its tiles.

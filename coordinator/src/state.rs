@@ -143,9 +143,9 @@ impl StateFolder {
         let names: Vec<_> = names.map_err(io)?.iter().map(fs::DirEntry::file_name).collect();
         let farm_path = path.join(FARM);
         let (is_known, jobs) = (farm_path.exists(), path.join(JOBS));
-        if !is_known
-            && names.iter().any(|name| ![LOCK, "farm.new", JOBS].iter().any(|ours| name == ours))
-        {
+        // Certificates may have been made before, and a file system of its own has a folder as well.
+        let known = [LOCK, "farm.new", JOBS, "access", "lost+found"];
+        if !is_known && names.iter().any(|name| !known.iter().any(|known| name == known)) {
             return Err(StateError::Foreign(path.to_owned()));
         }
         let lock = lock(path, &disk)?;

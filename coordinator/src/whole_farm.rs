@@ -20,11 +20,11 @@ use rtfarm_client::{Ended, JobState, NoPicture, Trouble};
 use rtfarm_core::{
     isa::Isa,
     prepared::PreparedScene,
-    render::{Quality, Sampling, render_tile},
+    render::{Quality, Sampling, Tally, render_tile},
     transfer::Transfer,
 };
-use rtfarm_job::{Order, RenderRequest};
-use rtfarm_picture::{Cache, Disk, Picture, PictureFormat};
+use rtfarm_job::{Order, Provenance, RenderRequest};
+use rtfarm_picture::{Cache, Disk, Notes, Picture, PictureFormat};
 use rtfarm_proto::{
     Access, Address, Bytes, JobId, PROTOCOL,
     wire::{self, Verdict, jobs_client::JobsClient, lease_response, submit_request::Part},
@@ -55,6 +55,9 @@ use crate::{
     simulation::SplitMix64,
     state::{Durability, StateFolder},
 };
+
+const VERSION: &str = "1";
+const BUILD: &str = "build";
 
 const SEEDS: u64 = 500;
 
@@ -111,16 +114,26 @@ fn expected(number: usize) -> &'static [u8] {
         let nothing = |_: &str| Err(std::io::ErrorKind::NotFound.into());
         let order = request().place(scene(number).as_bytes(), &nothing).order.unwrap();
         let Order { prepared, settings, grid, transfer, format, .. } = order;
+        let build = format!("{VERSION} ({BUILD})");
+        let provenance =
+            Provenance { build, scene: prepared.hash(), settings, grid, transfer, format };
         let prepared = PreparedScene::open(prepared).unwrap();
         let picture = Picture::new_in(Path::new("/tmp"), grid.window(), format, transfer).unwrap();
+        let mut tallies = BTreeMap::new();
         for tile in grid.render_order() {
             let mut go_on = || ControlFlow::Continue(());
             let area = grid.area(tile);
-            let tile = render_tile(&prepared, &settings.quality, area, Isa::Scalar, &mut go_on);
-            picture.put(area, &tile.unwrap().pixels).unwrap();
+            let rendered = render_tile(&prepared, &settings.quality, area, Isa::Scalar, &mut go_on);
+            let rendered = rendered.unwrap();
+            picture.put(area, &rendered.pixels).unwrap();
+            tallies.insert(tile, rendered.tally);
         }
+        let mut sum = Tally::default();
+        tallies.values().for_each(|tally| sum.add(tally));
+        let software = format!("rtfarm {}", provenance.build);
+        let notes = Notes { software, provenance: provenance.text(&sum) };
         let mut file = std::io::Cursor::new(Vec::new());
-        picture.encode(&mut file).unwrap();
+        picture.encode(&notes, &mut file).unwrap();
         file.into_inner()
     };
     &PNGS.get_or_init(|| (0..CLIENTS * PICTURES).map(render).collect())[number]
@@ -356,13 +369,14 @@ impl World {
             identity.farm = folder.farm();
         }
         let config = Config {
-            version: "1".to_owned(),
-            build: "build".to_owned(),
+            version: VERSION.to_owned(),
+            build: BUILD.to_owned(),
             reference: None,
             term: TERM,
             audit: f64::from(u8::from(self.hosts[0].is_liar)),
             upload_silence: Duration::from_secs(5),
             events: None,
+            begins_coarsely: false,
             host: None,
             scene_folder: self.folder.path().to_owned(),
             picture_folder: self.folder.path().to_owned(),

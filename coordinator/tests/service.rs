@@ -67,6 +67,7 @@ impl Farm {
             keeping: Keeping::default(),
             upload_silence: Duration::from_millis(600),
             events: None,
+            begins_coarsely: false,
             host: None,
             scene_folder: folder.path().to_owned(),
             picture_folder: folder.path().to_owned(),

@@ -6,7 +6,11 @@
 mod log;
 mod order;
 mod progress;
+mod provenance;
+mod time_left;
 
 pub use log::FinishedTile;
 pub use order::{MOST_TILES, Order, Placed, ReadyScene, Refusal, RenderRequest};
 pub use progress::{Outcome, Progress};
+pub use provenance::{Provenance, ProvenanceError};
+pub use time_left::{TileCosts, TimeLeft};

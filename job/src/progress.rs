@@ -4,6 +4,8 @@ use std::time::Duration;
 
 use rtfarm_core::render::Tally;
 
+use crate::TimeLeft;
+
 /// How far a job is.
 #[derive(Debug, Clone, Default)]
 pub struct Progress {
@@ -25,6 +27,8 @@ pub struct Progress {
     pub obstacle: Option<String>,
     /// How often that changed.
     pub obstacle_count: u32,
+    /// How long it will take yet, if that can be told.
+    pub left: Option<TimeLeft>,
     /// How it ended, once it has.
     pub outcome: Option<Outcome>,
 }

@@ -1,7 +1,7 @@
 //! A picture under way, which may outlive its process: then a record of each tile tells the next
 //! one what is in it.
 
-use std::{fs::File, io, os::unix::fs::FileExt, path::Path};
+use std::{fs::File, io, os::unix::fs::FileExt, path::Path, sync::Mutex};
 
 use rtfarm_core::{
     render::Tally,
@@ -34,6 +34,8 @@ const RECORDS: &str = "tiles";
 pub struct Canvas {
     picture: Picture,
     grid: TileGrid,
+    /// What its tiles took, by number, unless records have it.
+    tallies: Mutex<Vec<Tally>>,
     /// `None` when all ends with this process.
     records: Option<Records>,
 }
@@ -82,7 +84,8 @@ impl Canvas {
         transfer: Transfer,
     ) -> io::Result<Self> {
         let picture = Picture::new_in(folder, grid.window(), format, transfer)?;
-        Ok(Self { picture, grid, records: None })
+        let tallies = vec![Tally::default(); grid.count() as usize].into();
+        Ok(Self { picture, grid, tallies, records: None })
     }
 
     /// Begins a picture that outlives its process, in two files of `folder`, whose bytes are
@@ -106,7 +109,7 @@ impl Canvas {
         let file = create(RECORDS, record_offset(grid.count()))?;
         let key = blake3::derive_key(CONTEXT, subject);
         let records = Some(Records { file, key, disk: disk.clone() });
-        let canvas = Self { picture, grid, records };
+        let canvas = Self { picture, grid, tallies: Mutex::default(), records };
         canvas.sync()?;
         Ok(canvas)
     }
@@ -132,7 +135,7 @@ impl Canvas {
         let file = open(RECORDS, record_offset(grid.count()))?;
         let key = blake3::derive_key(CONTEXT, subject);
         let records = Some(Records { file, key, disk: disk.clone() });
-        Ok(Self { picture, grid, records })
+        Ok(Self { picture, grid, tallies: Mutex::default(), records })
     }
 
     /// Says whether it outlives its process.
@@ -144,6 +147,35 @@ impl Canvas {
     pub fn done(&self) -> io::Result<Vec<(TileId, TileRecord)>> {
         let records = self.records.as_ref();
         records.map_or_else(|| Ok(Vec::new()), |records| records.read(self.grid, &self.picture))
+    }
+
+    /// What the tiles took that are in the picture. They are summed by their numbers: floats that are
+    /// summed in another order give another sum.
+    pub fn tally(&self) -> io::Result<Tally> {
+        let mut sum = Tally::default();
+        if self.records.is_none() {
+            self.tallies
+                .lock()
+                .expect("nothing here panics")
+                .iter()
+                .for_each(|tally| sum.add(tally));
+            return Ok(sum);
+        }
+        for number in 0..self.grid.count() {
+            let tile = self.grid.tile(number).expect("the grid has so many tiles");
+            if let Some(record) = self.record(tile)? {
+                sum.add(&record.tally);
+            }
+        }
+        Ok(sum)
+    }
+
+    /// What is kept of a tile, if it is.
+    pub fn record(&self, tile: TileId) -> io::Result<Option<TileRecord>> {
+        let Some(records) = &self.records else { return Ok(None) };
+        let mut bytes = [0; RECORD_BYTES];
+        records.file.read_exact_at(&mut bytes, record_offset(tile.number()))?;
+        Ok((bytes[0] == DONE).then(|| TileRecord::from_bytes(&bytes)))
     }
 
     /// The picture.
@@ -164,7 +196,14 @@ impl Canvas {
             Ok((pixels.area, self.picture.encode_tile(&pixels)?))
         };
         let encoded: Vec<_> = tiles.iter().map(encode).collect::<Result<_, PutError>>()?;
-        let Some(records) = &self.records else { return Ok(self.picture.write(encoded)?) };
+        let Some(records) = &self.records else {
+            self.picture.write(encoded)?;
+            let mut tallies = self.tallies.lock().expect("nothing here panics");
+            for finished in tiles {
+                tallies[finished.tile.index()] = finished.record.tally;
+            }
+            return Ok(());
+        };
         let recorded = std::iter::zip(tiles, &encoded).map(|(finished, (_, bytes))| {
             (finished.tile, finished.record.to_bytes(&records.key, finished.tile, bytes))
         });
@@ -178,6 +217,11 @@ impl Canvas {
     pub fn clear(&self, tiles: &[TileId]) -> Result<(), PutError> {
         if let Some(records) = &self.records {
             records.write(tiles.iter().map(|&tile| (tile, [0; RECORD_BYTES])).collect())?;
+        } else {
+            let mut tallies = self.tallies.lock().expect("nothing here panics");
+            for tile in tiles {
+                tallies[tile.index()] = Tally::default();
+            }
         }
         let areas = tiles.iter().map(|&tile| self.grid.area(tile));
         for area in areas {

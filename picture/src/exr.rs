@@ -14,17 +14,22 @@ use exr::{
 };
 use rayon::prelude::*;
 
-use crate::Picture;
+use crate::{Notes, Picture};
 
 /// Writes a picture of 32-bit floats, in compressed blocks of 16 rows; some are compressed at once.
-pub(crate) fn encode(picture: &Picture, out: impl Write + Seek) -> io::Result<()> {
+pub(crate) fn encode(picture: &Picture, notes: &Notes, out: impl Write + Seek) -> io::Result<()> {
     const BLOCKS_AT_ONCE: usize = 8;
     // The format wants channels in alphabetical order.
     let channels = ["B", "G", "R"]
         .map(|name| ChannelDescription::named(Text::new_or_panic(name), SampleType::F32));
     let size = Vec2(picture.size().width() as usize, picture.size().height() as usize);
-    let header = Header::new(Text::new_or_panic("rtfarm"), size, channels.into_iter().collect())
-        .with_encoding(Compression::ZIP16, BlockDescription::ScanLines, LineOrder::Increasing);
+    let mut header =
+        Header::new(Text::new_or_panic("rtfarm"), size, channels.into_iter().collect())
+            .with_encoding(Compression::ZIP16, BlockDescription::ScanLines, LineOrder::Increasing);
+    let text = |text: &String| (!text.is_empty()).then(|| Text::new_or_panic(text));
+    let attributes = &mut header.own_attributes;
+    (attributes.software_name, attributes.comments) =
+        (text(&notes.software), text(&notes.provenance));
     block::write(out, [header].into_iter().collect(), true, |meta, writer| {
         let blocks: Vec<(usize, BlockIndex)> =
             block::enumerate_ordered_header_block_indices(&meta.headers).collect();

@@ -26,7 +26,7 @@ impl PictureFormat {
     }
 
     /// Pixels, which come as little-endian f32, as the picture's file holds them.
-    pub(crate) fn encode(self, pixels: &[u8], transfer: Transfer) -> Vec<u8> {
+    pub fn encode(self, pixels: &[u8], transfer: Transfer) -> Vec<u8> {
         let (pixels, _) = pixels.as_chunks::<PIXEL_BYTES>();
         let mut bytes = Vec::with_capacity(pixels.len() * self.bytes_per_pixel());
         for light in pixels.iter().flat_map(channels) {

@@ -8,10 +8,12 @@ mod exr;
 mod format;
 mod picture;
 mod png;
+mod reading;
 mod view;
 
 pub use canvas::{Canvas, CanvasTile, TileRecord};
 pub use disk::{Cache, Disk};
 pub use format::PictureFormat;
-pub use picture::{Picture, PutError, TilePixels, pixel_bytes};
+pub use picture::{Notes, Picture, PutError, TilePixels, pixel_bytes};
+pub use reading::PictureReader;
 pub use view::{View, pixel_values};

@@ -43,6 +43,15 @@ pub enum PutError {
     Io(#[from] io::Error),
 }
 
+/// What a picture's file says of it besides its pixels. Texts are ASCII; an empty one is not written.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct Notes {
+    /// What made it.
+    pub software: String,
+    /// What it depends on, and how good it is.
+    pub provenance: String,
+}
+
 /// A finished tile, as it travels and as it is put into a picture.
 #[derive(Debug, Clone, Copy)]
 pub struct TilePixels<'a> {
@@ -184,13 +193,14 @@ impl Picture {
         self.disk.sync(&self.file)
     }
 
-    /// Writes the whole picture as a file of its format. The same picture gives the same bytes.
+    /// Writes the whole picture as a file of its format, which says `notes`. The same picture with the same
+    /// notes gives the same bytes.
     /// A few bands of rows are in memory at a time.
-    pub fn encode(&self, out: impl Write + Seek) -> io::Result<()> {
+    pub fn encode(&self, notes: &Notes, out: impl Write + Seek) -> io::Result<()> {
         match self.format {
-            PictureFormat::Png8 => png::encode(self, BitDepth::Eight, out),
-            PictureFormat::Png16 => png::encode(self, BitDepth::Sixteen, out),
-            PictureFormat::ExrF32 => exr::encode(self, out),
+            PictureFormat::Png8 => png::encode(self, notes, BitDepth::Eight, out),
+            PictureFormat::Png16 => png::encode(self, notes, BitDepth::Sixteen, out),
+            PictureFormat::ExrF32 => exr::encode(self, notes, out),
         }
     }
 
@@ -286,7 +296,7 @@ mod tests {
         }
         let encode = || {
             let mut out = Cursor::new(Vec::new());
-            picture.encode(&mut out).unwrap();
+            picture.encode(&Notes::default(), &mut out).unwrap();
             out.into_inner()
         };
         let bytes = encode();
@@ -345,7 +355,7 @@ mod tests {
             let picture = Picture::new(file, size, format, Transfer::Srgb).unwrap();
             picture.put(Area::whole(size), &[[0.5, 7.0, -1.0]]).unwrap();
             let mut out = Cursor::new(Vec::new());
-            picture.encode(&mut out).unwrap();
+            picture.encode(&Notes::default(), &mut out).unwrap();
             out.into_inner()
         };
         for format in [PictureFormat::Png8, PictureFormat::Png16] {
@@ -394,7 +404,7 @@ mod tests {
                 picture.put_all(tiles).unwrap();
             }
             let mut out = Cursor::new(Vec::new());
-            picture.encode(&mut out).unwrap();
+            picture.encode(&Notes::default(), &mut out).unwrap();
             out.into_inner()
         };
         for format in [PictureFormat::Png8, PictureFormat::Png16, PictureFormat::ExrF32] {
@@ -413,7 +423,7 @@ mod tests {
         let picture = Picture::new_in(folder.path(), size, format, transfer).unwrap();
         assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0);
         let mut out = Cursor::new(Vec::new());
-        picture.encode(&mut out).unwrap();
+        picture.encode(&Notes::default(), &mut out).unwrap();
         let image = image::load_from_memory(out.get_ref()).unwrap().into_rgb8();
         assert_eq!(image.into_raw(), [0; 6], "it is black");
         let missing = folder.path().join("missing");

@@ -16,7 +16,7 @@ use rtfarm_core::{
     tile::{Area, Size},
     transfer::Transfer,
 };
-use rtfarm_picture::{Picture, PictureFormat};
+use rtfarm_picture::{Notes, Picture, PictureFormat};
 
 fn report(folder: &Path, args: &[&str]) -> Output {
     Command::new(env!("CARGO_BIN_EXE_rtfarm-report"))
@@ -39,7 +39,7 @@ fn render(scene: &Path, png: &Path) {
     let file = tempfile::tempfile().unwrap();
     let picture = Picture::new(file, size, PictureFormat::Png16, Transfer::None).unwrap();
     picture.put(area, &tile.pixels).unwrap();
-    picture.encode(File::create(png).unwrap()).unwrap();
+    picture.encode(&Notes::default(), File::create(png).unwrap()).unwrap();
 }
 
 #[test]

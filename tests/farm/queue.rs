@@ -214,3 +214,72 @@ fn a_tile_that_ends_three_workers_is_set_aside_the_others_finished_and_it_is_tri
     coordinator.signal(Signal::TERM);
     coordinator.wait();
 }
+
+#[test]
+fn what_became_of_a_tile_is_explained_and_what_happened_is_told_in_lines_of_json() {
+    let place = Place::new();
+    let (mut coordinator, url) =
+        start_farm_with(&place, "127.0.0.1:0", &["--events", "events.jsonl", "--audit", "0"]);
+    let job = detach(&place, &url, &["--size", "64x48", "--samples", "4096", "--tile", "16"]);
+    // Nobody is there, and who waits is told.
+    let entry = entry(&place, &url, &job);
+    assert_eq!(entry["obstacle"], "the farm has no worker");
+    let (_, _, log) = ask(&place, &url, &["explain", &job, "12"]);
+    assert!(log.contains("the job has the tiles 0 to 11"), "{log}");
+    let open = json(&place, &url, &["explain", &job, "5"]);
+    assert_eq!((&open["state"], &open["attempts"]), (&"open".into(), &Value::Array(vec![])));
+    let mut watch = place.start("watch.log", &["watch", &job, "--coordinator", &url]);
+    poll(|| watch.log().contains("the farm has no worker").then_some(()));
+
+    let worker = ["worker", "--threads", "1", "--coordinator", &url];
+    let mut first = place.start("first.log", &worker);
+    poll(|| (coordinator.workers().len() == 1).then_some(()));
+    // A tile in work when its worker is killed.
+    let lost = poll(|| {
+        let tiles =
+            (0..12).map(|tile: u32| json(&place, &url, &["explain", &job, &tile.to_string()]));
+        tiles.into_iter().find(|tile| tile["state"] == "in work")
+    });
+    first.signal(Signal::KILL);
+    first.wait();
+    let tile = lost["tile"].to_string();
+    poll(|| {
+        let told = json(&place, &url, &["explain", &job, &tile]);
+        (told["attempts"][0]["lost"] == "no progress for 0.5 s" || told["state"] == "done")
+            .then_some(())
+    });
+    let _second = place.start("second.log", &worker);
+    assert!(watch.wait().success(), "{}", watch.log());
+
+    let events = poll(|| {
+        let events = fs::read_to_string(place.path("events.jsonl")).unwrap();
+        events.contains("job finished").then_some(events)
+    });
+    let events: Vec<Value> =
+        events.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
+    let of = |name: &str| events.iter().filter(|event| event["event"] == name).collect::<Vec<_>>();
+    assert_eq!(of("job started")[0]["job"], job.as_str());
+    assert_eq!((of("worker joined").len(), of("tile done").len()), (2, 12));
+    assert!(events.iter().all(|event| event["time"].as_f64().unwrap() > 1.7e9));
+    for done in of("tile done") {
+        let told = json(&place, &url, &["explain", &job, &done["tile"].to_string()]);
+        for field in ["worker", "hash", "seconds", "rays", "samples"] {
+            assert_eq!(told[field], done[field], "{field}: {told}");
+        }
+        let attempts = told["attempts"].as_array().unwrap();
+        let won: Vec<&Value> =
+            attempts.iter().filter(|attempt| attempt["in_picture"] == true).collect();
+        assert_eq!((won.len(), &won[0]["worker"]), (1, &done["worker"]), "{told}");
+    }
+    let (_, text, _) = ask(&place, &url, &["explain", &job, &tile]);
+    assert!(text.contains("rendered by worker ") && text.contains("\nhash "), "{text}");
+
+    // Another start of the coordinator knows what is in the picture.
+    let before = json(&place, &url, &["explain", &job, "3"]);
+    coordinator.signal(Signal::TERM);
+    coordinator.wait();
+    let (_coordinator, url) = start_farm(&place, url.strip_prefix("http://").unwrap());
+    let after = json(&place, &url, &["explain", &job, "3"]);
+    assert_eq!((&after["hash"], &after["state"]), (&before["hash"], &"done".into()));
+    assert_eq!((&after["worker"], &after["attempts"]), (&Value::Null, &Value::Array(vec![])));
+}

@@ -153,6 +153,21 @@ fn who_has_no_token_or_that_of_another_role_or_farm_is_refused_and_told_why() {
 }
 
 #[test]
+fn certificates_made_before_are_those_of_the_coordinator() {
+    let place = Place::new();
+    let certs = ["certs", "--state", "farm", "--name", "renderhost", "--port", "7"];
+    assert_eq!(ask(&place, &certs), (Some(0), "farm/access\n".to_owned()));
+    let made = fs::read_to_string(place.path("farm/access/read")).unwrap();
+    assert!(made.contains("address https://renderhost:7\n"), "{made}");
+    check_refused(&place, &["certs", "--state", "farm", "--name", "a b"], 2, "");
+    let (_coordinator, url) = start_farm(&place);
+    fs::write(place.path("read"), made).unwrap();
+    fs::set_permissions(place.path("read"), fs::Permissions::from_mode(0o600)).unwrap();
+    let (code, said) = ask(&place, &["jobs", "--access", "read", "--coordinator", &url]);
+    assert_eq!(code, Some(0), "{said}");
+}
+
+#[test]
 fn a_socket_in_a_folder_of_ones_own_needs_no_token_and_another_is_refused() {
     let place = Place::new();
     fs::create_dir(place.path("own")).unwrap();

@@ -216,6 +216,7 @@ impl Farm {
                 job.progress.tiles_done = tiles.done_count();
                 job.earlier = earlier;
                 job.brought.clear();
+                job.costs = rtfarm_job::TileCosts::default();
                 tiles
             }
             (None, None) => return refused(Refused::TilesUnknown),

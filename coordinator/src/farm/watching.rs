@@ -40,6 +40,11 @@ impl Farm {
         self.leases.tiles(job).or(known.rest.as_ref()).map(flags)
     }
 
+    /// Says whether nobody is there to render.
+    pub(crate) fn lacks_workers(&self) -> bool {
+        self.members.is_empty()
+    }
+
     /// The tiles of a job that workers have and have not brought, and whether they are known to have
     /// begun them.
     pub(crate) fn in_work(&self, job: JobId) -> Vec<(TileId, WorkerId, bool)> {

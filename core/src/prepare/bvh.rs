@@ -94,7 +94,9 @@ pub(super) fn build_bvh(primitives: &mut [BuildPrimitive], alone_from: u32) -> V
     if primitives.is_empty() {
         return vec![Node::EMPTY];
     }
-    build_node(BuildRange::new(primitives, 0, alone_from), 0)
+    let mut nodes = Vec::new();
+    build_node(BuildRange::new(primitives, 0, alone_from), 0, &mut nodes);
+    nodes
 }
 
 impl<'a> BuildRange<'a> {
@@ -127,6 +129,11 @@ impl<'a> BuildRange<'a> {
         let (left, right) = self.primitives.split_at_mut(at);
         let range = |half, first| BuildRange::new(half, first, self.alone_from);
         [range(left, self.first), range(right, self.first + at)]
+    }
+
+    /// The leaf, where the range is one.
+    fn as_leaf(&self) -> Option<Child> {
+        self.is_leaf().then(|| Child::leaf(self.first, self.primitives.len()))
     }
 
     fn is_leaf(&self) -> bool {
@@ -254,8 +261,8 @@ impl Split {
     }
 }
 
-/// The nodes of one range, its own first; children's indices count from it.
-fn build_node(range: BuildRange<'_>, level: usize) -> Vec<Node> {
+/// Adds the nodes of one range, its own first; children's indices count from the first of `nodes`.
+fn build_node(range: BuildRange<'_>, level: usize, nodes: &mut Vec<Node>) {
     let mut ranges = vec![range];
     while ranges.len() < 8 {
         let widest = (0..ranges.len())
@@ -273,28 +280,38 @@ fn build_node(range: BuildRange<'_>, level: usize) -> Vec<Node> {
             node.planes[axis + 3][k] = range.bounds.max[axis];
         }
     }
-    let total: usize = ranges.iter().map(|range| range.primitives.len()).sum();
-    let build = |range: BuildRange<'_>| {
-        if range.is_leaf() {
-            Err(Child::leaf(range.first, range.primitives.len()))
-        } else {
-            Ok(build_node(range, level + 1))
-        }
-    };
-    let built: Vec<Result<Vec<Node>, Child>> = if total > SERIAL {
-        ranges.into_par_iter().map(build).collect()
-    } else {
-        ranges.into_iter().map(build).collect()
-    };
-    let below = built.iter().flatten().map(Vec::len);
-    let mut nodes = Vec::with_capacity(1 + below.sum::<usize>());
+    let own = nodes.len();
     nodes.push(node);
+    let total: usize = ranges.iter().map(|range| range.primitives.len()).sum();
+    if total <= SERIAL {
+        for (k, range) in ranges.into_iter().enumerate() {
+            if let Some(leaf) = range.as_leaf() {
+                nodes[own].children[k] = leaf;
+            } else {
+                nodes[own].children[k] = Child::inner(nodes.len());
+                build_node(range, level + 1, nodes);
+            }
+        }
+        return;
+    }
+    let build = |range: BuildRange<'_>| {
+        range.as_leaf().map_or_else(
+            || {
+                let mut below = Vec::new();
+                build_node(range, level + 1, &mut below);
+                Ok(below)
+            },
+            Err,
+        )
+    };
+    let built: Vec<Result<Vec<Node>, Child>> = ranges.into_par_iter().map(build).collect();
+    nodes.reserve_exact(built.iter().flatten().map(Vec::len).sum());
     for (k, child) in built.into_iter().enumerate() {
         match child {
-            Err(leaf) => nodes[0].children[k] = leaf,
+            Err(leaf) => nodes[own].children[k] = leaf,
             Ok(subtree) => {
                 let offset = nodes.len();
-                nodes[0].children[k] = Child::inner(offset);
+                nodes[own].children[k] = Child::inner(offset);
                 nodes.extend(subtree.into_iter().map(|mut node| {
                     node.children = node.children.map(|child| child.moved_by(offset));
                     node
@@ -302,7 +319,6 @@ fn build_node(range: BuildRange<'_>, level: usize) -> Vec<Node> {
             }
         }
     }
-    nodes
 }
 
 #[cfg(test)]

@@ -73,6 +73,17 @@ fn stop_unless(is_done: bool) -> ControlFlow<()> {
 /// Fewer rays of a class than this are traced alone.
 const FEWEST_RAYS: usize = 8;
 
+/// The places of rays that are traced in their own order.
+const IN_ORDER: [u16; RAYS_A_REPORT] = {
+    let mut places = [0; RAYS_A_REPORT];
+    let mut place = 0;
+    while place < RAYS_A_REPORT {
+        places[place] = place as u16;
+        place += 1;
+    }
+    places
+};
+
 /// Rays in the order in which they are traced: those of each class together, and at the end those
 /// that are in no packet.
 struct Order {
@@ -92,6 +103,12 @@ impl Order {
             *classes = kernel.classify(four, frame);
         }
         let classes = &classes[..rays.len()];
+        let differences = classes.iter().fold(0, |all, class| all | (class ^ classes[0]));
+        if differences == 0 {
+            let mut ends = [0; CLASSES + 1];
+            ends[classes[0] as usize..].fill(rays.len() as u16);
+            return Self { places: IN_ORDER, ends };
+        }
         let mut ends = [0; CLASSES + 1];
         for &class in classes {
             ends[class as usize] += 1;

@@ -45,7 +45,7 @@ fn as_png(pixels: &[[f32; 3]], settings: &Settings, transfer: Transfer) -> RgbIm
     let picture = Picture::new(file, settings.size, PictureFormat::Png8, transfer).unwrap();
     picture.put(whole(settings.size), pixels).unwrap();
     let mut file = Cursor::new(Vec::new());
-    picture.encode(&mut file).unwrap();
+    picture.encode(&rtfarm_picture::Notes::default(), &mut file).unwrap();
     image::load_from_memory(file.get_ref()).unwrap().into_rgb8()
 }
 

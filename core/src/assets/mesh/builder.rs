@@ -28,8 +28,59 @@ pub struct MeshFile {
 pub(super) struct MeshBuilder<T> {
     vertices: Vec<[T; 3]>,
     vertex_table: PointTable,
+    faces: MeshFaces,
+}
+
+/// Triangles of a mesh, in the order in which they come.
+#[derive(Debug, Default)]
+pub(super) struct MeshFaces {
     triangles: Vec<[u32; 3]>,
     dropped: DroppedFaces,
+}
+
+impl MeshFaces {
+    /// Adds a triangle with corners among `vertices`.
+    fn add_triangle<T: Copy + Into<f64>>(
+        &mut self,
+        vertices: &[[T; 3]],
+        corners: [u32; 3],
+    ) -> Result<(), MeshFault> {
+        let [a, b, c] = corners.map(|corner| position(vertices, corner));
+        if is_collinear(a, b, c) {
+            self.dropped.zero_area += 1;
+            return Ok(());
+        }
+        if self.triangles.len() == u32::MAX as usize {
+            return Err(MeshFault::TooLarge);
+        }
+        self.triangles.push(corners);
+        Ok(())
+    }
+
+    /// Adds a polygon cut into triangles, with corners among `vertices`.
+    pub(super) fn add_polygon<T: Copy + Into<f64>>(
+        &mut self,
+        vertices: &[[T; 3]],
+        corners: &[u32],
+    ) -> Result<(), MeshFault> {
+        match *corners {
+            [a, b, c] => return self.add_triangle(vertices, [a, b, c]),
+            [] | [_] | [_, _] => return Err(MeshFault::FewCorners(corners.len() as u64)),
+            _ => {}
+        }
+        let points: Vec<DVec3> = corners.iter().map(|&corner| position(vertices, corner)).collect();
+        let mut result = Ok(());
+        let is_cut = polygon::triangulate(&points, |triangle| {
+            if result.is_ok() {
+                result = self.add_triangle(vertices, triangle.map(|k| corners[k]));
+            }
+        });
+        if is_cut { result } else { Err(MeshFault::ManyCorners) }
+    }
+}
+
+fn position<T: Copy + Into<f64>>(vertices: &[[T; 3]], index: u32) -> DVec3 {
+    DVec3::from(vertices[index as usize].map(Into::into))
 }
 
 impl<T: Copy + Into<f64>> MeshBuilder<T> {
@@ -39,8 +90,10 @@ impl<T: Copy + Into<f64>> MeshBuilder<T> {
         Self {
             vertices: Vec::with_capacity(vertices),
             vertex_table: PointTable::new(PointHasher::new(), vertices),
-            triangles: Vec::with_capacity(triangles),
-            dropped: DroppedFaces::default(),
+            faces: MeshFaces {
+                triangles: Vec::with_capacity(triangles),
+                dropped: DroppedFaces::default(),
+            },
         }
     }
 
@@ -63,43 +116,31 @@ impl<T: Copy + Into<f64>> MeshBuilder<T> {
 
     /// Adds a triangle with corners that [`MeshBuilder::add_vertex`] gave.
     pub(super) fn add_triangle(&mut self, corners: [u32; 3]) -> Result<(), MeshFault> {
-        let [a, b, c] = corners.map(|corner| self.position(corner));
-        if is_collinear(a, b, c) {
-            self.dropped.zero_area += 1;
-            return Ok(());
-        }
-        if self.triangles.len() == u32::MAX as usize {
-            return Err(MeshFault::TooLarge);
-        }
-        self.triangles.push(corners);
-        Ok(())
+        self.faces.add_triangle(&self.vertices, corners)
     }
 
     /// Adds a polygon cut into triangles.
     pub(super) fn add_polygon(&mut self, corners: &[u32]) -> Result<(), MeshFault> {
-        match *corners {
-            [a, b, c] => return self.add_triangle([a, b, c]),
-            [] | [_] | [_, _] => return Err(MeshFault::FewCorners(corners.len() as u64)),
-            _ => {}
-        }
-        let points: Vec<DVec3> = corners.iter().map(|&corner| self.position(corner)).collect();
-        let mut result = Ok(());
-        let is_cut = polygon::triangulate(&points, |triangle| {
-            if result.is_ok() {
-                result = self.add_triangle(triangle.map(|k| corners[k]));
-            }
-        });
-        if is_cut { result } else { Err(MeshFault::ManyCorners) }
+        self.faces.add_polygon(&self.vertices, corners)
     }
 
-    fn position(&self, index: u32) -> DVec3 {
-        DVec3::from(self.vertices[index as usize].map(Into::into))
+    /// The vertices that are there.
+    pub(super) fn vertices(&self) -> &[[T; 3]] {
+        &self.vertices
+    }
+
+    /// Adds faces whose corners are among the vertices.
+    pub(super) fn append(&mut self, faces: &MeshFaces) -> Result<(), MeshFault> {
+        self.faces.triangles.extend(&faces.triangles);
+        self.faces.dropped.zero_area += faces.dropped.zero_area;
+        let is_too_large = self.faces.triangles.len() > u32::MAX as usize;
+        if is_too_large { Err(MeshFault::TooLarge) } else { Ok(()) }
     }
 
     /// Drops every copy of an earlier triangle. Only triangles of one smallest corner can be equal,
     /// and those are few and near each other: this costs less than a table of all.
     fn drop_copies(&mut self) {
-        let triangles = &self.triangles;
+        let triangles = &self.faces.triangles;
         // How many triangles have each smallest corner, then where those begin in `order`.
         let mut starts = vec![0_u32; self.vertices.len() + 1];
         for &triangle in triangles {
@@ -128,11 +169,11 @@ impl<T: Copy + Into<f64>> MeshBuilder<T> {
         if copies.is_empty() {
             return;
         }
-        self.dropped.duplicates += copies.len() as u64;
+        self.faces.dropped.duplicates += copies.len() as u64;
         copies.sort_unstable();
         let mut copies = copies.into_iter().peekable();
         let mut index = 0;
-        self.triangles.retain(|_| {
+        self.faces.triangles.retain(|_| {
             let is_copy = copies.next_if_eq(&index).is_some();
             index += 1;
             !is_copy
@@ -143,17 +184,17 @@ impl<T: Copy + Into<f64>> MeshBuilder<T> {
         mut self,
         vertices: impl FnOnce(Vec<[T; 3]>) -> MeshVertices,
     ) -> Result<MeshFile, MeshError> {
-        if self.triangles.is_empty() {
+        if self.faces.triangles.is_empty() {
             return Err(MeshFault::Empty.of_file());
         }
         self.vertex_table = PointTable::new(PointHasher::new(), 0); // Its memory is needed.
         self.drop_copies();
-        let (mut kept, mut triangles) = (self.vertices, self.triangles);
+        let (mut kept, mut triangles) = (self.vertices, self.faces.triangles);
         kept.shrink_to_fit();
         triangles.shrink_to_fit();
         Ok(MeshFile {
             shape: MeshShape { vertices: vertices(kept), triangles },
-            dropped: self.dropped,
+            dropped: self.faces.dropped,
         })
     }
 }

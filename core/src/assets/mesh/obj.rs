@@ -1,8 +1,10 @@
 //! OBJ files: vertices and polygons; all else is skipped. Source: Wavefront, "Object Files
 //! (.obj)", Advanced Visualizer manual, appendix B1.
 
+use rayon::prelude::*;
+
 use super::{
-    builder::{MeshBuilder, MeshFile},
+    builder::{MeshBuilder, MeshFaces, MeshFile},
     error::{MeshError, MeshFault},
 };
 use crate::text::{
@@ -10,8 +12,106 @@ use crate::text::{
     number::scan_number,
 };
 
+/// Large files are read by pieces of about so many bytes.
+const PIECE: usize = 1 << 20;
+
 /// Reads a file.
 pub(super) fn read_obj(text: &[u8]) -> Result<MeshFile, MeshError> {
+    read_in_pieces(text, PIECE).map_or_else(|| read_in_order(text), Ok)
+}
+
+/// Reads a file of several pieces on rayon's threads: its vertices, then its faces. `None` where that
+/// would not be all of it, or in another order: a face names a vertex that comes later, or something
+/// is wrong.
+fn read_in_pieces(text: &[u8], size: usize) -> Option<MeshFile> {
+    let pieces = pieces(text, size);
+    if pieces.len() == 1 {
+        return None;
+    }
+    let of_pieces: Vec<Vec<[f64; 3]>> =
+        pieces.par_iter().map(|piece| read_positions(piece)).collect::<Option<_>>()?;
+    let count = of_pieces.iter().map(Vec::len).sum();
+    let mut mesh = MeshBuilder::<f64>::with_capacity(count, 0);
+    let mut vertices = Vec::with_capacity(count);
+    let mut firsts = Vec::with_capacity(pieces.len());
+    for positions in of_pieces {
+        firsts.push(vertices.len());
+        for position in positions {
+            vertices.push(mesh.add_vertex(position).ok()?);
+        }
+    }
+    let faces: Vec<MeshFaces> = (pieces.par_iter().zip(firsts))
+        .map(|(piece, first)| read_faces(piece, first, &vertices, mesh.vertices()))
+        .collect::<Option<_>>()?;
+    for faces in faces {
+        mesh.append(&faces).ok()?;
+    }
+    mesh.into_mesh().ok()
+}
+
+/// Cuts a text into pieces of whole lines.
+fn pieces(text: &[u8], size: usize) -> Vec<&[u8]> {
+    let (mut pieces, mut rest) = (Vec::new(), text);
+    while rest.len() > size {
+        let goes_on = |end: &usize| matches!(rest[..*end], [.., b'\\'] | [.., b'\\', b'\r']);
+        let mut ends = memchr::memchr_iter(b'\n', &rest[size..]).map(|end| size + end);
+        let Some(end) = ends.find(|end| !goes_on(end)) else { break };
+        let (piece, later) = rest.split_at(end + 1);
+        pieces.push(piece);
+        rest = later;
+    }
+    pieces.push(rest);
+    pieces
+}
+
+/// The vertices of a piece.
+fn read_positions(piece: &[u8]) -> Option<Vec<[f64; 3]>> {
+    let mut positions = Vec::new();
+    let mut line = Line { text: piece, at: 0 };
+    while line.at < piece.len() {
+        line.skip_blanks();
+        if let [b'v', next, ..] = piece[line.at..]
+            && is_blank(next)
+        {
+            line.at += 1;
+            positions.push(line.read_position().ok()?);
+        }
+        line.skip();
+    }
+    Some(positions)
+}
+
+/// The faces of a piece that follows `count` of the file's vertices. These are `numbers` among
+/// `vertices`.
+fn read_faces(
+    piece: &[u8],
+    mut count: usize,
+    numbers: &[u32],
+    vertices: &[[f64; 3]],
+) -> Option<MeshFaces> {
+    let (mut faces, mut corners) = (MeshFaces::default(), Vec::new());
+    let mut line = Line { text: piece, at: 0 };
+    while line.at < piece.len() {
+        line.skip_blanks();
+        match piece[line.at..] {
+            [b'v', next, ..] if is_blank(next) => count += 1,
+            [b'f', next, ..] if is_blank(next) => {
+                line.at += 1;
+                line.read_corners(&numbers[..count], count, &mut corners).ok()?;
+                if corners.contains(&EARLY) {
+                    return None;
+                }
+                faces.add_polygon(vertices, &corners).ok()?;
+            }
+            _ => {}
+        }
+        line.skip();
+    }
+    Some(faces)
+}
+
+/// Reads a file line by line.
+fn read_in_order(text: &[u8]) -> Result<MeshFile, MeshError> {
     let mut mesh = MeshBuilder::<f64>::with_capacity(0, 0);
     // The file's vertices by their numbers less one.
     let mut vertices: Vec<u32> = Vec::new();
@@ -25,12 +125,7 @@ pub(super) fn read_obj(text: &[u8]) -> Result<MeshFile, MeshError> {
         match text[start..] {
             [b'v', next, ..] if is_blank(next) => {
                 line.at += 1;
-                let mut position = [0.0; 3];
-                for number in &mut position {
-                    line.skip_blanks();
-                    *number = scan_number(text, &mut line.at)
-                        .ok_or_else(|| MeshFault::Number.at_byte(text, line.at))?;
-                }
+                let position = line.read_position()?;
                 let vertex =
                     mesh.add_vertex(position).map_err(|fault| fault.at_byte(text, start))?;
                 vertices.push(vertex);
@@ -87,6 +182,17 @@ impl Line<'_> {
                 _ => return,
             }
         }
+    }
+
+    /// Reads the coordinates of a vertex.
+    fn read_position(&mut self) -> Result<[f64; 3], MeshError> {
+        let mut position = [0.0; 3];
+        for number in &mut position {
+            self.skip_blanks();
+            *number = scan_number(self.text, &mut self.at)
+                .ok_or_else(|| MeshFault::Number.at_byte(self.text, self.at))?;
+        }
+        Ok(position)
     }
 
     /// Goes to the next line.
@@ -154,5 +260,53 @@ impl Line<'_> {
             index = line.read_index().unwrap_or(0);
         }
         index
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::fmt::Write;
+
+    use super::*;
+
+    /// Vertices in turn with faces of all kinds; equal vertices, faces without area and copies among
+    /// them.
+    fn text(count: usize) -> String {
+        let mut text = String::new();
+        for k in 0..count {
+            writeln!(text, "v {} {}.5 {}e-1", k % 50, k / 50, k * k % 7).unwrap();
+            if k % 3 == 0 {
+                text.push_str("v 1 2 3\r\n# no v 1 2 \\\n");
+            }
+            if k >= 10 {
+                writeln!(text, "f {} \\\n -1/2/3 -{}//1 # a face", k / 2 + 1, 2 + k % 5).unwrap();
+            }
+            if k % 10 == 9 {
+                writeln!(text, "\tf -1 -2 -4 -3\nf 1 2 2\nf 1 3 5\r").unwrap();
+            }
+        }
+        text
+    }
+
+    #[test]
+    fn pieces_give_what_the_whole_gives() {
+        let text = text(500);
+        let expected = read_in_order(text.as_bytes()).unwrap();
+        assert!(expected.shape.triangles.len() > 400 && expected.dropped.duplicates > 0);
+        for size in [1, 10, 37, 100, 999, 5000] {
+            assert!(pieces(text.as_bytes(), size).len() > 1);
+            assert_eq!(read_in_pieces(text.as_bytes(), size).as_ref(), Some(&expected), "{size}");
+        }
+    }
+
+    #[test]
+    fn what_is_wrong_or_early_is_left_to_who_reads_in_order() {
+        for line in ["f 1 2 100000", "v 1 2", "f 0 1 2", "f 1 2", "f 1 2 x", "v 1 2 1e999"] {
+            let text = format!("{}{line}\n{}", text(50), text(50));
+            assert_eq!(read_in_pieces(text.as_bytes(), 100), None, "{line}");
+        }
+        let late = format!("v 0 0 0\nv 1 0 0\nf 1 2 3\nv 0 1 0\n{}", text(50));
+        assert_eq!(read_in_pieces(late.as_bytes(), 100), None);
+        assert!(read_obj(late.as_bytes()).is_ok());
     }
 }
