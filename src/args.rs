@@ -11,7 +11,7 @@ use clap::{
     Args as ClapArgs, Parser, Subcommand, ValueEnum, builder::NonEmptyStringValueParser,
     value_parser,
 };
-use rtfarm_coordinator::{Limits, Role};
+use rtfarm_coordinator::{Limits, OrderLimits, Role};
 use rtfarm_core::{
     isa::{Isa, IsaError},
     render::{Quality, SampleCount, SampleLimit, Sampling, StandardError},
@@ -473,6 +473,22 @@ pub(crate) struct CoordinatorArgs {
     #[arg(long, value_name = "S", default_value = "30", value_parser = parse_seconds, env = "RTFARM_UPLOAD_SECONDS", help_heading = LIMITS)]
     pub(crate) upload_seconds: Duration,
 
+    /// The most bytes, in GB, that scenes have together which are being sent.
+    #[arg(long, value_name = "GB", default_value = "8", value_parser = parse_gigabytes, env = "RTFARM_UPLOAD_GB", help_heading = LIMITS)]
+    upload_gb: u64,
+
+    /// The most jobs that have not ended; who has the token `admin` may order more, also of the next two.
+    #[arg(long, value_name = "N", default_value = "1000", env = "RTFARM_MOST_JOBS", help_heading = LIMITS)]
+    most_jobs: u64,
+
+    /// The most pixels, in millions, of their pictures together.
+    #[arg(long, value_name = "MILLIONS", default_value = "16384", value_parser = parse_millions, env = "RTFARM_MOST_MEGAPIXELS", help_heading = LIMITS)]
+    most_megapixels: u64,
+
+    /// The most bytes, in GB, that all jobs have on disk.
+    #[arg(long, value_name = "GB", default_value = "256", value_parser = parse_gigabytes, env = "RTFARM_MOST_GB", help_heading = LIMITS)]
+    most_gb: u64,
+
     /// A worker that makes no progress for this long loses its tiles to others.
     #[arg(long, value_name = "S", default_value = "4", value_parser = parse_seconds, env = "RTFARM_LEASE_SECONDS", help_heading = WORK)]
     pub(crate) lease_seconds: Duration,
@@ -808,6 +824,12 @@ impl RenderArgs {
 }
 
 impl CoordinatorArgs {
+    /// How much may be ordered.
+    pub(crate) fn orders(&self) -> OrderLimits {
+        let (jobs, pixels) = (self.most_jobs, self.most_megapixels);
+        OrderLimits { jobs, pixels, bytes: self.most_gb, upload_bytes: self.upload_gb }
+    }
+
     /// How connections of strangers are limited.
     pub(crate) fn limits(&self) -> Limits {
         let (handshake, first_word) = (self.handshake_seconds, self.greeting_seconds);
@@ -908,7 +930,14 @@ fn parse_seconds(text: &str) -> Result<Duration, String> {
 fn parse_gigabytes(text: &str) -> Result<u64, &'static str> {
     let bytes = text.parse().ok().map(|gigabytes: f64| gigabytes * 1e9);
     let bytes = bytes.filter(|bytes| (1.0..=1e18).contains(bytes));
-    bytes.map(|bytes| bytes as u64).ok_or("memory is a number of GB above 0")
+    bytes.map(|bytes| bytes as u64).ok_or("a number of GB above 0 is wanted")
+}
+
+/// Answers with ones.
+fn parse_millions(text: &str) -> Result<u64, &'static str> {
+    let ones = text.parse().ok().map(|millions: f64| millions * 1e6);
+    let ones = ones.filter(|ones| (1.0..=1e18).contains(ones));
+    ones.map(|ones| ones as u64).ok_or("a number of millions above 0 is wanted")
 }
 
 fn parse_fraction(text: &str) -> Result<f64, &'static str> {

@@ -64,6 +64,7 @@ pub(crate) async fn run(
         events: args.events.clone(),
         begins_coarsely: false,
         host: Some(args.name.clone().unwrap_or_else(own_name)),
+        orders: args.orders(),
         scene_folder: folder.clone(),
         picture_folder: folder,
     };

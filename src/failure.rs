@@ -76,8 +76,12 @@ pub(crate) fn explain_usage(error: &clap::Error) -> ExitCode {
         return if is_shown { ExitCode::SUCCESS } else { ExitCode::from(1) };
     }
     let text = error.to_string();
-    let (first, _) = text.split_once("\n\n").unwrap_or((&text, ""));
-    let words: Vec<&str> = first.split_whitespace().collect();
+    // The mistake, and what was meant if it can be guessed.
+    let told = text
+        .split("\n\n")
+        .enumerate()
+        .filter(|(k, part)| *k == 0 || part.trim_start().starts_with("tip: a similar"));
+    let words: Vec<&str> = told.flat_map(|(_, part)| part.split_whitespace()).collect();
     Console::plain().tell(&words.join(" "));
     ExitCode::from(2)
 }

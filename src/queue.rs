@@ -8,6 +8,7 @@ use std::{
 };
 
 use anyhow::{Context, anyhow};
+use blake3::Hash;
 use rtfarm_client::{FIRST_PAUSE, LONGEST_PAUSE, is_lost, plain, time_left};
 use rtfarm_core::{render::Tally, tile::Size};
 use rtfarm_job::{Progress, TimeLeft};
@@ -241,11 +242,8 @@ fn explain(job: u64, tile: u32, told: &wire::ExplainResponse) -> Answer {
         _ => "open",
     };
     let tally = told.tally.unwrap_or_default();
-    let hash = told.hash.iter().fold(String::new(), |mut hex, byte| {
-        let _ = write!(hex, "{byte:02x}");
-        hex
-    });
-    let is_known = !hash.is_empty();
+    let hash = Hash::from_slice(&told.hash).map(|hash| hash.to_hex()).ok();
+    let is_known = hash.is_some();
     let attempts = told.attempts.iter().map(|attempt| {
         json!({
             "worker": attempt.worker, "host": attempt.host, "lease": attempt.lease,
@@ -257,11 +255,11 @@ fn explain(job: u64, tile: u32, told: &wire::ExplainResponse) -> Answer {
         "job": job.to_string(), "tile": tile, "state": state, "area": [x, y, width, height],
         "worker": (told.worker > 0).then_some(told.worker), "host": told.host,
         "seconds": is_known.then_some(told.seconds), "rays": is_known.then_some(tally.rays),
-        "samples": is_known.then_some(tally.samples), "hash": is_known.then_some(&hash),
+        "samples": is_known.then_some(tally.samples), "hash": hash.as_deref(),
         "attempts": attempts.collect::<Vec<Value>>(),
     });
     let mut text = format!("tile {tile} of job {job}, {width}x{height} at ({x}, {y}): {state}\n");
-    if is_known {
+    if let Some(hash) = hash {
         let by = match told.worker {
             0 => "under an earlier start of the coordinator".to_owned(),
             worker => format!("by worker {worker} on {}", told.host),

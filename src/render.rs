@@ -8,7 +8,7 @@ use std::{
 };
 
 use anyhow::{Context, anyhow};
-use rtfarm_coordinator::{Config, Coordinator, Job, Keeping, Listener};
+use rtfarm_coordinator::{Config, Coordinator, Job, Keeping, Listener, OrderLimits};
 use rtfarm_core::{
     isa::Isa,
     language::{Style, draw_diagnostics},
@@ -421,6 +421,7 @@ impl Render<'_> {
             events: None,
             begins_coarsely: self.args.show,
             host: None,
+            orders: OrderLimits::default(),
             scene_folder: folder.path().to_owned(),
             picture_folder: first.output.folder(),
         })?;

@@ -3,7 +3,7 @@
 
 use std::{
     fmt::Write as _,
-    io::{self, Write as _},
+    io::{self, Write},
     ops::ControlFlow,
     path::Path,
 };
@@ -59,18 +59,17 @@ impl Found {
             text = format!("{json:#}\n");
         } else {
             for difference in differences.iter().chain(other_build) {
-                let _ = writeln!(text, "{difference}");
+                text += difference;
+                text += "\n";
             }
             if differences.is_empty() {
                 let right = checked - wrong.len();
-                let _ = write!(
+                let others = if wrong.is_empty() { "" } else { &format!(", but not {wrong:?}") };
+                let _ = writeln!(
                     text,
-                    "{right} of {checked} tiles are the same to the bit, of {tile_count}"
+                    "{checked} of {tile_count} tiles were rendered again: \
+                     {right} are the same to the bit{others}"
                 );
-                if !wrong.is_empty() {
-                    let _ = write!(text, "; others are {wrong:?}");
-                }
-                text.push('\n');
             }
         }
         io::stdout()
@@ -222,7 +221,7 @@ mod tests {
                 let chosen = choose(TileShare::Some(wanted), count).unwrap();
                 let tiles: Vec<u32> = (0..count).filter(|&tile| chosen(tile)).collect();
                 assert_eq!(tiles.len() as u32, wanted.min(count), "{count} {wanted}");
-                for tile in tiles {
+                for &tile in &tiles {
                     seen[tile as usize] = true;
                 }
             }

@@ -17,7 +17,9 @@ use std::{
     time::Duration,
 };
 
-use rtfarm_coordinator::{Config, Coordinator, Durability, Keeping, Listener, StateFolder, listen};
+use rtfarm_coordinator::{
+    Config, Coordinator, Durability, Keeping, Listener, OrderLimits, StateFolder, listen,
+};
 use rtfarm_core::{
     render::{Quality, Sampling},
     tile::{Size, TileGrid},
@@ -89,6 +91,7 @@ async fn run(load: Load, folder: PathBuf) -> Result<(), Error> {
         events: None,
         begins_coarsely: false,
         host: None,
+        orders: OrderLimits::default(),
         scene_folder: scenes.path().to_owned(),
         picture_folder: folder,
         keeping: Keeping::default(),

@@ -51,7 +51,7 @@ where
         self.service.poll_ready(context)
     }
 
-    fn call(&mut self, request: Request<Body>) -> Answering {
+    fn call(&mut self, mut request: Request<Body>) -> Answering {
         if request.version() < Version::HTTP_2 {
             // Pages from anywhere can have a browser say that, and nobody else does.
             let status = Status::failed_precondition("gRPC is spoken in HTTP/2");
@@ -60,10 +60,14 @@ where
         if let Some(security) = &self.security {
             let path = request.uri().path();
             let shown = request.headers().get(AUTHORIZATION).map(HeaderValue::as_bytes);
-            if let Err(status) = security.check(path, shown) {
-                tracing::warn!(path, reason = status.message(), "refused a call");
-                return Box::pin(ready(Ok(status.into_http())));
-            }
+            let role = match security.check(path, shown) {
+                Ok(role) => role,
+                Err(status) => {
+                    tracing::warn!(path, reason = status.message(), "refused a call");
+                    return Box::pin(ready(Ok(status.into_http())));
+                }
+            };
+            request.extensions_mut().insert(role);
             if let Some(peer) = request.extensions().get::<Peer>() {
                 peer.admit();
             }

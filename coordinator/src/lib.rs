@@ -8,6 +8,7 @@
 //! knows only what stands before it:
 //!
 //! ```text
+//! upload <- shell, service
 //! identity, tiles, pace <- lease, members, waiting, audit <- farm, store, record <- state <- job
 //! farm <- events; events, job <- shell <- live, metrics <- page; shell <- service <- run
 //! security, accept <- guard, page <- service; accept <- run
@@ -42,6 +43,7 @@ mod state;
 mod steady;
 mod store;
 mod tiles;
+mod upload;
 mod waiting;
 #[cfg(test)]
 mod whole_farm;
@@ -53,3 +55,4 @@ pub use run::{Coordinator, Listener, ServeError};
 pub use security::{Role, Security, SecurityError, renew_token, revoke_token};
 pub use shell::{Config, SubmitError};
 pub use state::{Durability, StateError, StateFolder};
+pub use upload::OrderLimits;

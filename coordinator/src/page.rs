@@ -119,8 +119,8 @@ impl Page {
             }
             _ => {}
         }
-        if let Err(response) = self.check_token(&parts) {
-            return *response;
+        if let Some(response) = self.refusal(&parts) {
+            return response;
         }
         let answer = match path {
             "/page/events" => self.events(&parts),
@@ -150,11 +150,12 @@ impl Page {
             || self.shell.config.host.as_ref().is_some_and(|ours| ours.eq_ignore_ascii_case(name))
     }
 
-    fn check_token(&self, parts: &Parts) -> Result<(), Box<Response<Body>>> {
+    /// Answers who shows no token that may read.
+    fn refusal(&self, parts: &Parts) -> Option<Response<Body>> {
         let shown = parts.headers.get(AUTHORIZATION).map(HeaderValue::as_bytes);
         let checked = match &self.keeper {
             Keeper::Nobody => Ok(()),
-            Keeper::Farm(security) => security.check(parts.uri.path(), shown),
+            Keeper::Farm(security) => security.check(parts.uri.path(), shown).map(drop),
             Keeper::Token(hash) => {
                 let token = shown.and_then(|shown| shown.strip_prefix(b"Bearer "));
                 // Hashes of this kind are compared in constant time.
@@ -170,12 +171,12 @@ impl Page {
             };
             let mut response = refused(code, status.message());
             response.headers_mut().insert(WWW_AUTHENTICATE, HeaderValue::from_static("Bearer"));
-            return Err(Box::new(response));
+            return Some(response);
         }
         if let Some(peer) = parts.extensions.get::<Peer>() {
             peer.admit();
         }
-        Ok(())
+        None
     }
 
     /// Streams what there is to see of a job, or of a farm without any, as server-sent events.
@@ -328,6 +329,7 @@ mod tests {
             events: None,
             begins_coarsely: false,
             host: Some("farm.example".to_owned()),
+            orders: crate::upload::OrderLimits::default(),
             scene_folder: folder.to_owned(),
             picture_folder: folder.to_owned(),
         };

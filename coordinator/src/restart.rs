@@ -27,6 +27,7 @@ use crate::{
     record::Ticket,
     shell::{Config, Shell},
     state::{Durability, StateError, StateFolder},
+    upload::OrderLimits,
 };
 
 const BUILD: &str = "1.2.3 test";
@@ -80,6 +81,7 @@ impl Coordinator {
             events: None,
             begins_coarsely: false,
             host: None,
+            orders: OrderLimits::default(),
             scene_folder: PathBuf::new(),
             picture_folder: PathBuf::new(),
         };

@@ -212,3 +212,61 @@ where
     let (served, ()) = tokio::join!(serve, accept_all(accept, door, send));
     served
 }
+
+#[cfg(test)]
+mod tests {
+    use std::fs;
+
+    use rtfarm_proto::{Access, Address};
+
+    use super::*;
+    use crate::{farm::Keeping, security::make_certificates, upload::OrderLimits};
+
+    /// What becomes of a connection to a coordinator whose certificate is good to that day.
+    async fn connect(last_day: (i32, u8, u8)) -> Result<(), String> {
+        let state = tempfile::tempdir().unwrap();
+        let folder = state.path().join("access");
+        fs::create_dir(&folder).unwrap();
+        make_certificates(&folder, last_day).unwrap();
+        let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+        let address: Address =
+            format!("https://{}", listener.local_addr().unwrap()).parse().unwrap();
+        let security = Security::open(state.path(), &address).unwrap();
+        let coordinator = Coordinator::new(Config {
+            version: String::new(),
+            build: String::new(),
+            reference: None,
+            term: Duration::from_secs(1),
+            audit: 0.0,
+            keeping: Keeping::default(),
+            upload_silence: Duration::from_secs(1),
+            events: None,
+            begins_coarsely: false,
+            host: None,
+            orders: OrderLimits::default(),
+            scene_folder: state.path().to_owned(),
+            picture_folder: state.path().to_owned(),
+        })
+        .unwrap();
+        let listener = Listener::Tls(listener, security, Limits::default());
+        let serving =
+            tokio::spawn(async move { coordinator.run(listener, std::future::pending()).await });
+        let access = Access::read(&fs::read_to_string(folder.join("read")).unwrap()).unwrap();
+        let connected = access.connect().await;
+        serving.abort();
+        connected.map(drop).map_err(|error| with_reasons(&error))
+    }
+
+    /// An error with all its reasons.
+    fn with_reasons(error: &dyn std::error::Error) -> String {
+        let reasons = std::iter::successors(error.source(), |error| error.source());
+        reasons.fold(error.to_string(), |text, reason| format!("{text}: {reason}"))
+    }
+
+    #[tokio::test]
+    async fn an_expired_certificate_is_not_believed() {
+        assert_eq!(connect((4096, 1, 1)).await, Ok(()));
+        let refused = connect((2020, 1, 1)).await.unwrap_err();
+        assert!(refused.contains("expired"), "{refused}");
+    }
+}

@@ -22,7 +22,10 @@ use std::{
 };
 
 use blake3::Hash;
-use rcgen::{BasicConstraints, CertificateParams, DnType, IsCa, Issuer, KeyPair, KeyUsagePurpose};
+use rcgen::{
+    BasicConstraints, CertificateParams, DnType, IsCa, Issuer, KeyPair, KeyUsagePurpose,
+    date_time_ymd,
+};
 use rtfarm_proto::{Access, Address, CERTIFIED_NAME};
 use tempfile::NamedTempFile;
 use tokio::time::Instant;
@@ -38,6 +41,9 @@ const TOKENS: &str = "tokens";
 
 /// A token that is revoked is not taken this long afterwards, at the latest.
 const REREAD: Duration = Duration::from_secs(1);
+
+/// A certificate is good to this day: who could take its key could take the authority's as well.
+const LAST_DAY: (i32, u8, u8) = (4096, 1, 1);
 
 /// The end of a certificate as PEM.
 const END: &str = "-----END CERTIFICATE-----\n";
@@ -156,7 +162,7 @@ impl Security {
                 .map_err(|error| SecurityError::Io(folder.clone(), error))?;
         }
         if !folder.join(CERTIFICATE).exists() {
-            make_certificates(&folder)?;
+            make_certificates(&folder, LAST_DAY)?;
         }
         let is_new = !folder.join(TOKENS).exists();
         let mut tokens = if is_new { Tokens::default() } else { Tokens::read(&folder)? };
@@ -187,9 +193,9 @@ impl Security {
         Ok(ServerTlsConfig::new().identity(Identity::from_pem(&pem, &pem)).timeout(handshake))
     }
 
-    /// Says whether who shows this `Authorization` may call that method. A file of tokens that was
+    /// Says as whom who shows this `Authorization` may call that method. A file of tokens that was
     /// written to is read anew.
-    pub(crate) fn check(&self, path: &str, authorization: Option<&[u8]>) -> Result<(), Status> {
+    pub(crate) fn check(&self, path: &str, authorization: Option<&[u8]>) -> Result<Role, Status> {
         let token = authorization.and_then(|value| value.strip_prefix(b"Bearer "));
         let Some(token) = token else {
             return Err(Status::unauthenticated(
@@ -199,15 +205,15 @@ impl Security {
         // Hashes of this kind are compared in constant time.
         let hash = blake3::hash(token);
         let known = self.known();
-        let roles = known.hashes.iter().filter(|(_, known)| *known == hash).map(|&(role, _)| role);
-        let roles: Vec<Role> = roles.collect();
-        match roles.first() {
-            None => Err(Status::unauthenticated("the token is not known, or not any more")),
-            Some(_) if roles.iter().any(|role| role.may(path)) => Ok(()),
-            Some(role) => Err(Status::new(
+        let mut roles =
+            known.hashes.iter().filter(|(_, known)| *known == hash).map(|&(role, _)| role);
+        match (roles.clone().find(|role| role.may(path)), roles.next()) {
+            (Some(role), _) => Ok(role),
+            (None, Some(role)) => Err(Status::new(
                 Code::PermissionDenied,
                 format!("the token is one to {role}, which does not allow this"),
             )),
+            (None, None) => Err(Status::unauthenticated("the token is not known, or not any more")),
         }
     }
 
@@ -312,7 +318,10 @@ impl Tokens {
 }
 
 /// Makes an authority and a certificate that it vouches for.
-fn make_certificates(folder: &Path) -> Result<(), SecurityError> {
+pub(crate) fn make_certificates(
+    folder: &Path,
+    (year, month, day): (i32, u8, u8),
+) -> Result<(), SecurityError> {
     let mut of_authority = CertificateParams::default();
     of_authority.distinguished_name.push(DnType::CommonName, "rtfarm authority");
     of_authority.is_ca = IsCa::Ca(BasicConstraints::Constrained(0));
@@ -324,6 +333,7 @@ fn make_certificates(folder: &Path) -> Result<(), SecurityError> {
 
     let mut shown = CertificateParams::new([CERTIFIED_NAME.to_owned()])?;
     shown.distinguished_name.push(DnType::CommonName, CERTIFIED_NAME);
+    shown.not_after = date_time_ymd(year, month, day);
     let key = KeyPair::generate()?;
     let certificate = shown.signed_by(&key, &issuer)?;
     write(&folder.join(CERTIFICATE), &(certificate.pem() + &key.serialize_pem()))

@@ -2,7 +2,6 @@
 //! nowhere else.
 
 use std::{
-    collections::HashMap,
     io::{self, BufWriter, Read, Seek},
     pin::Pin,
     sync::Arc,
@@ -14,8 +13,8 @@ use rtfarm_core::{
     render::Tally,
     tile::{Crop, Size, TileId},
 };
-use rtfarm_job::{Outcome, Placed, Refusal, RenderRequest};
-use rtfarm_picture::{TilePixels, TileRecord};
+use rtfarm_job::{Order, Outcome, Placed, Refusal, RenderRequest};
+use rtfarm_picture::{Picture, TilePixels, TileRecord};
 use rtfarm_proto::{
     CHUNK_BYTES, JobId, LONGEST_WAIT, LeaseName, MESSAGE_BYTES, PROTOCOL, Renewal, WireError,
     WorkerId, scene_hash, transfer,
@@ -44,13 +43,14 @@ use crate::{
     members::{MemberEntry, NoMember, Process, Standing},
     page::{Keeper, Page},
     record::{Ticket, to_event, to_standing},
-    security::Security,
+    security::{Role, Security},
     shell::{ChangeError, Config, Shell},
     tiles::PixelHash,
+    upload::{Ordered, Spool, Uploads},
 };
 
 /// The most bytes that a scene and its files may have.
-const LONGEST_BUNDLE: usize = 1 << 31;
+const LONGEST_BUNDLE: u64 = 1 << 31;
 
 /// A watching client hears of changes no more often than this.
 const WATCH_PERIOD: Duration = Duration::from_millis(50);
@@ -109,9 +109,12 @@ pub(crate) fn services(
     let farm = farm_server::FarmServer::new(FarmService { shell: Arc::clone(shell) })
         .max_decoding_message_size(MESSAGE_BYTES)
         .max_encoding_message_size(MESSAGE_BYTES);
-    let jobs = jobs_server::JobsServer::new(JobsService { shell: Arc::clone(shell) })
-        .max_decoding_message_size(MESSAGE_BYTES)
-        .max_encoding_message_size(MESSAGE_BYTES);
+    let jobs = jobs_server::JobsServer::new(JobsService {
+        shell: Arc::clone(shell),
+        uploads: Uploads::default(),
+    })
+    .max_decoding_message_size(MESSAGE_BYTES)
+    .max_encoding_message_size(MESSAGE_BYTES);
     (farm, jobs)
 }
 
@@ -278,6 +281,7 @@ fn to_verdict(verdict: Verdict) -> wire::Verdict {
 
 pub(crate) struct JobsService {
     shell: Arc<Shell>,
+    uploads: Uploads,
 }
 
 #[tonic::async_trait]
@@ -286,32 +290,39 @@ impl jobs_server::Jobs for JobsService {
         &self,
         request: Request<Streaming<wire::SubmitRequest>>,
     ) -> Result<Response<wire::SubmitResponse>, Status> {
-        let bundle = match receive(request.into_inner(), &self.shell).await? {
+        let is_admin = request.extensions().get::<Role>() == Some(&Role::Admin);
+        let bundle = match receive(request.into_inner(), &self.shell, &self.uploads).await? {
             Received::Known(job) => return Ok(Response::new(accepted(&job, &self.shell))),
             Received::New(bundle) => bundle,
         };
-        let Bundle { order, text, files } = *bundle;
+        let Bundle { order, spool } = *bundle;
         let ticket = to_ticket(&order);
         let wanted = to_request(order).map_err(invalid)?;
         let shell = Arc::clone(&self.shell);
         let client_gone = CancellationToken::new();
         let _here = client_gone.clone().drop_guard();
         let (answer, unclaimed) = blocking(move || {
-            let resolve = |path: &str| {
-                files.get(path).cloned().ok_or_else(|| {
-                    let reason = format!("`{path}` was not sent along with the scene");
-                    io::Error::new(io::ErrorKind::NotFound, reason)
-                })
-            };
             let name = wanted.name.clone();
-            let Placed { order, diagnostics, omitted, .. } = wanted.place(&text, &resolve);
+            let text = spool.text().map_err(|error| cannot_spool(&error))?;
+            let placed = wanted.place(&text, &|path: &str| spool.file(path));
+            let Placed { order, diagnostics, omitted, .. } = placed;
             let mut report = draw_diagnostics(&name, &text, &diagnostics, Style::Plain);
             report.extend(omitted.summary());
             if client_gone.is_cancelled() {
                 return Err(Status::cancelled("the client is gone"));
             }
+            drop((text, spool));
             let job = order.and_then(|order| {
-                shell.submit(order, ticket).map_err(|error| Refusal::Other(error.to_string()))
+                // Two that come together do not both take the last place.
+                let _one = shell.ordering.lock().expect("nothing there panics");
+                let limits = shell.config.orders;
+                let refusal = || limits.refusal(ordered(&shell), to_be_ordered(&order));
+                match refusal().filter(|_| !is_admin) {
+                    Some(reason) => Err(Refusal::Other(reason)),
+                    None => shell
+                        .submit(order, ticket)
+                        .map_err(|error| Refusal::Other(error.to_string())),
+                }
             });
             let refused = |reason| wire::SubmitResponse {
                 outcome: Some(submit_response::Outcome::Refused(reason)),
@@ -620,11 +631,34 @@ fn to_explanation(
     }
 }
 
-/// A scene as a client sends it: its text and the files that it names.
+/// A scene as a client sends it.
 struct Bundle {
     order: wire::Order,
-    text: Vec<u8>,
-    files: HashMap<String, Vec<u8>>,
+    spool: Spool,
+}
+
+/// What the farm has to do and to keep.
+fn ordered(shell: &Shell) -> Ordered {
+    let mut all = Ordered::default();
+    for (JobEntry { phase, terms, .. }, job) in shell.jobs() {
+        all.bytes += terms.byte_count;
+        if !matches!(phase, JobPhase::Finished | JobPhase::Failed) {
+            all.jobs += 1;
+            all.pixels += job.grid.window().size().pixel_count();
+        }
+    }
+    all
+}
+
+/// What an order adds to it.
+fn to_be_ordered(order: &Order) -> Ordered {
+    let size = order.grid.window().size();
+    let bytes = order.prepared.as_ref().len() as u64 + Picture::byte_count(size, order.format);
+    Ordered { jobs: 1, pixels: size.pixel_count(), bytes }
+}
+
+fn cannot_spool(error: &io::Error) -> Status {
+    Status::resource_exhausted(format!("the scene cannot be kept while it comes: {error}"))
 }
 
 /// What a client sent.
@@ -634,7 +668,11 @@ enum Received {
     Known(Arc<Job>),
 }
 
-async fn receive(parts: Streaming<wire::SubmitRequest>, shell: &Shell) -> Result<Received, Status> {
+async fn receive(
+    parts: Streaming<wire::SubmitRequest>,
+    shell: &Shell,
+    uploads: &Uploads,
+) -> Result<Received, Status> {
     let mut parts = Upload { parts, silence: shell.config.upload_silence };
     // What is not wanted is refused before it is sent.
     let Some(submit_request::Part::Order(order)) = parts.next().await?.and_then(|part| part.part)
@@ -645,28 +683,38 @@ async fn receive(parts: Streaming<wire::SubmitRequest>, shell: &Shell) -> Result
     if let Some(job) = shell.claim(&order.key) {
         return Ok(Received::Known(job));
     }
-    let (mut text, mut files) = (Vec::new(), HashMap::<String, Vec<u8>>::new());
-    let mut byte_count = 0;
+    let mut spool = Spool::new(&shell.config.scene_folder, uploads);
+    let most = shell.config.orders.upload_bytes;
+    let mut names = 0;
     while let Some(part) = parts.next().await? {
-        match part.part {
+        let (path, piece) = match part.part {
             Some(submit_request::Part::Order(_)) => {
                 return Err(Status::invalid_argument("a scene has one order"));
             }
-            Some(submit_request::Part::Text(piece)) => {
-                byte_count += piece.len();
-                text.extend_from_slice(&piece);
-            }
-            Some(submit_request::Part::File(piece)) => {
-                byte_count += piece.path.len() + piece.data.len();
-                files.entry(piece.path).or_default().extend_from_slice(&piece.data);
-            }
-            None => {}
-        }
-        if byte_count > LONGEST_BUNDLE {
+            Some(submit_request::Part::Text(piece)) => (None, piece),
+            Some(submit_request::Part::File(piece)) => (Some(piece.path), piece.data),
+            None => continue,
+        };
+        names += path.as_ref().map_or(0, String::len) as u64;
+        spool = blocking(move || {
+            let mut spool = spool.map_err(|error| cannot_spool(&error))?;
+            spool.put(path, &piece).map_err(|error| cannot_spool(&error))?;
+            Ok(Ok(spool))
+        })
+        .await?;
+        let Ok(spool) = &spool else { continue };
+        if spool.byte_count() + names > LONGEST_BUNDLE {
             return Err(Status::resource_exhausted("the scene and its files are too long"));
         }
+        if spool.bytes_of_all() > most {
+            return Err(Status::resource_exhausted(format!(
+                "scenes that are being sent may have {:.2} GB together; try again later",
+                most as f64 / 1e9
+            )));
+        }
     }
-    Ok(Received::New(Box::new(Bundle { order, text, files })))
+    let spool = spool.map_err(|error| cannot_spool(&error))?;
+    Ok(Received::New(Box::new(Bundle { order, spool })))
 }
 
 /// What a client sends, piece by piece.

@@ -35,6 +35,7 @@ use crate::{
     state::{Durability, KeptJob, StateFolder},
     store::SceneFile,
     tiles::{MOST_LOSSES, Tiles},
+    upload::OrderLimits,
     waiting::{Ask, AskId},
 };
 
@@ -63,7 +64,9 @@ pub struct Config {
     pub upload_silence: Duration,
     /// Where what happens is told besides, if anywhere: a JSON object a line.
     pub events: Option<PathBuf>,
-    /// For prepared scenes: a folder that is nobody else's.
+    /// How much may be ordered.
+    pub orders: OrderLimits,
+    /// For scenes: a folder that is nobody else's.
     pub scene_folder: PathBuf,
     /// For pictures while they are rendered.
     pub picture_folder: PathBuf,
@@ -107,6 +110,8 @@ pub(crate) struct Shell {
     state: Mutex<State>,
     /// Held while a job is made or changed and that is kept: one at a time.
     changing: Mutex<()>,
+    /// Held while it is found out whether there is room for an order, and it is taken.
+    pub(crate) ordering: Mutex<()>,
     /// Told when the machine wants to be woken earlier than it will be.
     earlier: Notify,
     /// What happened.
@@ -219,6 +224,7 @@ impl Shell {
             written: Notify::new(),
             state: Mutex::new(state),
             changing: Mutex::default(),
+            ordering: Mutex::default(),
             earlier: Notify::new(),
             events,
             stop: CancellationToken::new(),

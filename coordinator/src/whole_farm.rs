@@ -54,6 +54,7 @@ use crate::{
     shell::Shell,
     simulation::SplitMix64,
     state::{Durability, StateFolder},
+    upload::OrderLimits,
 };
 
 const VERSION: &str = "1";
@@ -380,6 +381,7 @@ impl World {
             events: None,
             begins_coarsely: false,
             host: None,
+            orders: OrderLimits::default(),
             scene_folder: self.folder.path().to_owned(),
             picture_folder: self.folder.path().to_owned(),
             keeping: Keeping::default(),

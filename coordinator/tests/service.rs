@@ -6,7 +6,7 @@ use std::{
     time::Duration,
 };
 
-use rtfarm_coordinator::{Config, Coordinator, Keeping, Listener};
+use rtfarm_coordinator::{Config, Coordinator, Keeping, Listener, OrderLimits};
 use rtfarm_core::{
     prepared::SceneHash,
     render::{Quality, Sampling, Settings},
@@ -54,6 +54,10 @@ struct Farm {
 
 impl Farm {
     async fn new() -> Self {
+        Self::with(OrderLimits::default()).await
+    }
+
+    async fn with(orders: OrderLimits) -> Self {
         let folder = tempfile::tempdir().unwrap();
         let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
         let address: Address =
@@ -69,6 +73,7 @@ impl Farm {
             events: None,
             begins_coarsely: false,
             host: None,
+            orders,
             scene_folder: folder.path().to_owned(),
             picture_folder: folder.path().to_owned(),
         })
@@ -450,6 +455,44 @@ async fn an_upload_that_stands_still_is_dropped() {
     let dropped = begin_to_submit(&farm, VERSION).await;
     let dropped = tokio::time::timeout(Duration::from_secs(10), dropped).await;
     assert_eq!(dropped.expect("it is dropped").unwrap(), Code::DeadlineExceeded);
+}
+
+#[tokio::test]
+async fn what_is_being_sent_has_so_many_bytes_of_all_clients_together() {
+    let farm = Farm::with(OrderLimits { upload_bytes: 3000, ..OrderLimits::default() }).await;
+    let (send, receive) = tokio::sync::mpsc::channel(4);
+    let part = |part| wire::SubmitRequest { part: Some(part) };
+    let long = || part(Part::Text(vec![b' '; 2000].into()));
+    send.send(part(Part::Order(order(VERSION)))).await.unwrap();
+    send.send(long()).await.unwrap();
+    let mut jobs = farm.jobs.clone();
+    let first = tokio_stream::wrappers::ReceiverStream::new(receive);
+    let first = tokio::spawn(async move { jobs.submit(first).await });
+
+    // The first is not at its end, and there is no room for a second as long.
+    let mut jobs = farm.jobs.clone();
+    let mut second = async || {
+        let parts = [part(Part::Order(order(VERSION))), long(), part(Part::Text(SCENE.into()))];
+        jobs.submit(tokio_stream::iter(parts)).await
+    };
+    loop {
+        match second().await {
+            // It was earlier than the other.
+            Ok(_) => tokio::task::yield_now().await,
+            Err(status) => {
+                assert_eq!(status.code(), Code::ResourceExhausted);
+                assert!(status.message().contains("scenes that are being sent"), "{status}");
+                break;
+            }
+        }
+    }
+    send.send(part(Part::Text(SCENE.into()))).await.unwrap();
+    drop(send);
+    assert!(matches!(
+        first.await.unwrap().unwrap().into_inner().outcome,
+        Some(Outcome::Accepted(_))
+    ));
+    second().await.unwrap();
 }
 
 #[tokio::test]

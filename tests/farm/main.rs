@@ -696,12 +696,13 @@ fn bad_input_gives_one_clear_line_and_an_exit_code() {
         ("scene.rt", "o.png", "--error=0", 2, "must be a number above 0 and at most 1"),
         ("scene.rt", "o.png", "--max-samples=7", 2, "must be a whole number from 8 to 65536"),
         ("scene.rt", "o.png", "--isa=mmx", 2, "`mmx` is not an instruction set"),
-        ("scene.rt", "o.png", "--wokers=2", 2, "unexpected argument '--wokers'"),
+        ("scene.rt", "o.png", "--wokers=2", 2, "tip: a similar argument exists: '--workers'"),
     ] {
         let args = ["render", scene, "-o", output, rest];
         let given = if rest.is_empty() { 4 } else { 5 };
         check_refused(&place, &args[..given], code, reason);
     }
+    check_refused(&place, &["rendr", "scene.rt"], 2, "tip: a similar subcommand exists: 'render'");
     check_refused(&place, &["render", "scene.rt"], 2, "--output <FILE>");
     let huge = ["render", "scene.rt", "-o", "o.png", "--size", "65535x65535", "--tile", "4"];
     check_refused(&place, &huge, 2, "at most 1048576 tiles");

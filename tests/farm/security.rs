@@ -5,6 +5,11 @@ use std::{
     os::unix::fs::PermissionsExt,
 };
 
+use rtfarm_proto::{
+    Access, MESSAGE_BYTES,
+    wire::{self, farm_client::FarmClient},
+};
+
 use super::*;
 
 /// A farm with certificates and tokens, started; and its address.
@@ -25,6 +30,45 @@ fn ask(place: &Place, words: &[&str]) -> (Option<i32>, String) {
     let mut said = process.log();
     process.stdout.as_mut().unwrap().read_to_string(&mut said).unwrap();
     (code, said)
+}
+
+/// Has one who has a token send messages that are too long.
+fn flood(access: &Path) -> thread::JoinHandle<()> {
+    let access = Access::read(&fs::read_to_string(access).unwrap()).unwrap();
+    thread::spawn(move || {
+        let runtime = tokio::runtime::Runtime::new().unwrap();
+        runtime.block_on(async {
+            let mut client = FarmClient::new(access.connect().await.unwrap());
+            for length in [MESSAGE_BYTES, 2 * MESSAGE_BYTES, 8 * MESSAGE_BYTES] {
+                let pixels = vec![0; length].into();
+                let tiles = vec![wire::FinishedTile { pixels, ..Default::default() }];
+                let request = wire::DeliverRequest { tiles, ..Default::default() };
+                let status = client.deliver(request).await.unwrap_err();
+                assert!(status.message().contains("message length too large"), "{status}");
+            }
+        });
+    })
+}
+
+#[test]
+fn orders_have_a_budget_which_the_token_of_those_who_look_after_the_farm_exceeds() {
+    let place = Place::new();
+    let args = ["coordinator", "--listen", "127.0.0.1:0", "--state", "farm"];
+    let limits = ["--most-jobs", "1", "--most-megapixels", "0.01", "--most-gb", "0.001"];
+    let mut coordinator = place.start("coordinator.log", &[&args[..], &limits].concat());
+    coordinator.read_line();
+    let order = |role: &str, size: &str| {
+        let access = format!("farm/access/{role}");
+        let words = ["submit", "scene.rt", "-o", "out.exr", "--detach", "--size", size];
+        ask(&place, &[&words[..], &["--access", &access]].concat())
+    };
+    for (size, reason) in [("200x100", "20000 pixels more than the 0"), ("64x64", "")] {
+        let (code, said) = order("submit", size);
+        assert_eq!((code == Some(0), said.contains(reason)), (reason.is_empty(), true), "{said}");
+    }
+    let (code, said) = order("submit", "8x8");
+    assert!(code == Some(2) && said.contains("there are 1 jobs already"), "{said}");
+    assert_eq!(order("admin", "400x300").0, Some(0));
 }
 
 #[test]
@@ -63,8 +107,10 @@ fn a_farm_serves_those_who_have_a_token_while_others_storm_it() {
             })
         })
         .collect();
+    let flood = flood(&place.path("farm/access/work"));
     assert!(submit.wait().success(), "{}", submit.log());
     assert!(fs::read(place.path("out.png")).unwrap() == here);
+    flood.join().unwrap();
     for stranger in storm {
         stranger.join().unwrap();
     }

@@ -112,6 +112,9 @@ pub(crate) enum CallErrorKind {
 /// The longest that a short question may wait for its answer.
 const DEADLINE: Duration = Duration::from_secs(15);
 
+/// The longest that tiles may wait to be acknowledged: a disk may be slow.
+const DELIVERY: Duration = Duration::from_secs(30);
+
 /// The longest that a worker that leaves waits to be heard.
 const FAREWELL: Duration = Duration::from_secs(1);
 
@@ -121,7 +124,7 @@ impl Call {
         match self {
             Self::Connect | Self::Join | Self::Renew { .. } => DEADLINE,
             Self::Lease { .. } => LONGEST_WAIT + DEADLINE,
-            Self::Deliver { .. } => DEADLINE * 2,
+            Self::Deliver { .. } => DELIVERY,
             Self::Leave { .. } => FAREWELL,
         }
     }

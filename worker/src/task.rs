@@ -217,12 +217,8 @@ impl Tasks {
             self.silent_since.get_or_insert(since);
         }
         let give_up_at = self.give_up_at();
-        let may_repeat = match attempts.call {
-            // Whatever the reason is, a coordinator may be there a moment later.
-            Call::Connect => true,
-            Call::Leave { .. } => false,
-            _ => error.kind == CallErrorKind::NoAnswer,
-        };
+        let is_farewell = matches!(attempts.call, Call::Leave { .. });
+        let may_repeat = !is_farewell && error.kind == CallErrorKind::NoAnswer;
         let delay =
             attempts.backoff.next().filter(|&delay| give_up_at.is_none_or(|end| now + delay < end));
         match delay.filter(|_| may_repeat) {
