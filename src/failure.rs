@@ -77,11 +77,10 @@ pub(crate) fn explain_usage(error: &clap::Error) -> ExitCode {
     }
     let text = error.to_string();
     // The mistake, and what was meant if it can be guessed.
-    let told = text
-        .split("\n\n")
-        .enumerate()
-        .filter(|(k, part)| *k == 0 || part.trim_start().starts_with("tip: a similar"));
-    let words: Vec<&str> = told.flat_map(|(_, part)| part.split_whitespace()).collect();
-    Console::plain().tell(&words.join(" "));
+    let is_guess =
+        |part: &str| part.trim_start().starts_with("tip: ") && part.contains(" similar ");
+    let told = text.split("\n\n").enumerate().filter(|&(k, part)| k == 0 || is_guess(part));
+    let one_line = |(_, part): (_, &str)| part.split_whitespace().collect::<Vec<_>>().join(" ");
+    Console::plain().tell(&told.map(one_line).collect::<Vec<_>>().join("; "));
     ExitCode::from(2)
 }

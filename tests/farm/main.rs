@@ -702,7 +702,12 @@ fn bad_input_gives_one_clear_line_and_an_exit_code() {
         let given = if rest.is_empty() { 4 } else { 5 };
         check_refused(&place, &args[..given], code, reason);
     }
-    check_refused(&place, &["rendr", "scene.rt"], 2, "tip: a similar subcommand exists: 'render'");
+    check_refused(
+        &place,
+        &["rendr", "scene.rt"],
+        2,
+        "'rendr'; tip: some similar subcommands exist: 'report', 'retry', 'render'",
+    );
     check_refused(&place, &["render", "scene.rt"], 2, "--output <FILE>");
     let huge = ["render", "scene.rt", "-o", "o.png", "--size", "65535x65535", "--tile", "4"];
     check_refused(&place, &huge, 2, "at most 1048576 tiles");
