@@ -289,10 +289,11 @@ impl Worker {
         let error = match (&call, kind) {
             (Call::Leave { .. }, _) => return self.end_as_left(),
             (Call::Connect, _) => WorkerError::Connect(self.coordinator.clone(), message),
-            (Call::Join, CallErrorKind::Refused) => WorkerError::Refused(message),
+            (_, CallErrorKind::Forbidden) | (Call::Join, CallErrorKind::Refused) => {
+                WorkerError::Refused(message)
+            }
             (Call::Join, _) => WorkerError::Gone(message),
             (_, CallErrorKind::NotMember) => return self.join_again(call, &message, now),
-            (_, CallErrorKind::Forbidden) => WorkerError::Refused(message),
             (_, CallErrorKind::Nonsense) => WorkerError::Nonsense(message),
             _ => WorkerError::Gone(message),
         };

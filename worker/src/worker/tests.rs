@@ -364,6 +364,7 @@ fn small_tiles_are_handed_on_and_delivered_together() {
     let first = rendered(&mut bench, 1);
     assert_eq!(bench.turn(), 4);
     bench.absorb();
+    assert!(!bench.has(is_lease), "99 tiles are enough");
     assert_eq!(bench.renderings.len(), 4 * TURNS_AT_HAND);
     let more = rendered(&mut bench, 7);
     bench.absorb();
@@ -376,21 +377,46 @@ fn small_tiles_are_handed_on_and_delivered_together() {
         bench.absorb();
     }
     assert_eq!(bench.pixels(), 4 * MOST_TURNS_OF_PIXELS, "slow deliveries stop the threads");
+    while !bench.has(is_lease) {
+        if bench.has(is_deliver) {
+            bench.answer(is_deliver, Answer::Delivered);
+        } else {
+            rendered(&mut bench, 1);
+            bench.absorb();
+        }
+    }
+    let Stage::Working(member) = &bench.worker.stage else { panic!("it does not work") };
+    let left: usize = member.leases.values().map(|held| held.tiles_left).sum();
+    assert_eq!(left, TURNS_AHEAD * 4 - 1);
+    let Call::Lease { most_tiles, .. } = bench.asked(is_lease) else { panic!() };
+    assert_eq!(most_tiles, LONGEST_RUN_IN_TURNS * 4);
 }
 
 #[test]
 fn a_message_holds_so_many_bytes_and_no_more() {
-    let mut bench = Bench::rendering(1, 3);
-    let big = |(lease, tile)| Delivery {
-        pixels: vec![0; DELIVERY_BYTES / 2].into(),
-        ..delivery(lease, tile)
-    };
-    let begun = std::mem::take(&mut bench.renderings);
-    let rendered = begun.into_iter().map(|(task, tile)| (task, Some(big(tile))));
-    bench.worker.on_tiles_rendered(rendered.collect(), bench.now);
+    for (part, turn) in [(2, 2), (1, 1)] {
+        let mut bench = Bench::rendering(1, 3);
+        let big = |(lease, tile)| Delivery {
+            pixels: vec![0; DELIVERY_BYTES / part].into(),
+            seconds: TURN.as_secs_f64() / 10.0,
+            ..delivery(lease, tile)
+        };
+        let begun = std::mem::take(&mut bench.renderings);
+        let rendered = begun.into_iter().map(|(task, tile)| (task, Some(big(tile))));
+        bench.worker.on_tiles_rendered(rendered.collect(), bench.now);
+        assert_eq!(bench.turn(), turn, "quick tiles, but large ones");
+        bench.absorb();
+        let call = bench.answer(is_deliver, Answer::Delivered);
+        let Call::Deliver { tiles, .. } = call else { panic!("{call:?}") };
+        assert_eq!(tiles.len(), part);
+    }
+    let mut bench = Bench::rendering(1, 1);
+    let (task, (lease, tile)) = bench.renderings.pop_first().unwrap();
+    let pixels = vec![0; DELIVERY_BYTES + 1].into();
+    let tile = Delivery { pixels, ..delivery(lease, tile) };
+    bench.worker.on_tiles_rendered(vec![(task, Some(tile))], bench.now);
     bench.absorb();
-    let Call::Deliver { tiles, .. } = bench.answer(is_deliver, Answer::Delivered) else { panic!() };
-    assert_eq!(tiles.len(), 2);
+    assert!(bench.has(is_deliver), "a tile that is too large for a message goes alone");
 }
 
 #[test]
@@ -749,6 +775,7 @@ fn workers_do_not_all_ask_again_at_once() {
 fn a_refused_worker_ends_at_once() {
     for (kind, reason) in [
         (CallErrorKind::Refused, "the coordinator refuses this worker: for a reason"),
+        (CallErrorKind::Forbidden, "the coordinator refuses this worker: for a reason"),
         (CallErrorKind::Other, "the coordinator is gone: for a reason"),
         (CallErrorKind::NotMember, "the coordinator is gone: for a reason"),
     ] {
@@ -757,6 +784,11 @@ fn a_refused_worker_ends_at_once() {
         bench.fail(|call| matches!(call, Call::Join), failure(kind));
         assert_eq!(bench.exit, Some(Err(reason.to_owned())));
     }
+    let mut bench = Bench::joined(1);
+    bench.fail(is_lease, failure(CallErrorKind::Forbidden));
+    bench.fail(|call| matches!(call, Call::Leave { .. }), failure(CallErrorKind::Forbidden));
+    let reason = "the coordinator refuses this worker: for a reason".to_owned();
+    assert_eq!(bench.exit, Some(Err(reason)), "its token was revoked");
 }
 
 #[test]
@@ -822,6 +854,12 @@ fn a_worker_that_is_drained_delivers_what_its_threads_have_and_leaves() {
     assert_eq!(count, TURNS_AT_HAND, "no tile is begun any more");
     bench.answer(|call| matches!(call, Call::Leave { .. }), Answer::Left);
     assert_eq!(bench.exit, Some(Ok(())));
+
+    let mut bench = Bench::rendering(1, 2);
+    bench.render();
+    bench.worker.on_stop(Duration::from_secs(10), bench.now);
+    bench.absorb();
+    assert!(!bench.has(|call| matches!(call, Call::Leave { .. })), "one comes, one is rendered");
 }
 
 #[test]
