@@ -21,7 +21,7 @@ use crate::{
 };
 
 /// Camera rays in a batch: enough to fill the queues, few enough to stay in the cache.
-const BATCH: usize = 2048;
+const BATCH: usize = 512;
 
 /// The side of what an adaptive sample sees of a texture, as a share of the square that it stands for.
 /// What a filter takes from beyond the square is in all samples and no difference of theirs tells it,
