@@ -317,6 +317,8 @@ fn tiles_are_asked_for_before_the_threads_run_dry() {
         bench.answer(is_deliver, Answer::Delivered);
         assert_eq!(bench.has(is_lease), left < TURNS_AHEAD * 2, "{left} tiles left");
     }
+    let Call::Lease { most_tiles, .. } = bench.asked(is_lease) else { panic!() };
+    assert_eq!(most_tiles, LONGEST_RUN_A_THREAD * 2);
 }
 
 #[test]
