@@ -128,7 +128,7 @@ fn verify(
         return Ok(Some(found));
     }
 
-    let chosen = choose(args.tiles, tile_count).map_err(Failure::from)?;
+    let chosen = choose(args.tiles, tile_count, random_key().map_err(Failure::from)?);
     let prepared = PreparedScene::open(order.prepared).map_err(anyhow::Error::from)?;
     let pool = rayon::ThreadPoolBuilder::new().num_threads(args.threads()).build();
     let pool = pool.map_err(anyhow::Error::from)?;
@@ -188,25 +188,30 @@ fn prepare(args: &VerifyArgs, text: &SceneText, provenance: &Provenance) -> Resu
     })
 }
 
-/// Which tiles are rendered again. Nobody knows before which, unless all are.
-fn choose(share: TileShare, count: u32) -> io::Result<impl Fn(u32) -> bool + Sync> {
+/// Which of `count` tiles are rendered again: nobody who lacks the key knows before, unless all are.
+fn choose(share: TileShare, count: u32, key: [u8; 32]) -> impl Fn(u32) -> bool + Sync {
     let wanted = match share {
         TileShare::All => count,
         TileShare::Some(wanted) => wanted.min(count),
         TileShare::Few => (count / 32).clamp(8, 1024).min(count),
     };
-    let mut key = [0; 32];
-    rustix::rand::getrandom(&mut key, rustix::rand::GetRandomFlags::empty())?;
     // Of each run of `count / wanted` tiles one, at a place that is drawn.
     let (count, wanted) = (u64::from(count), u64::from(wanted));
-    Ok(move |number: u32| {
+    move |number: u32| {
         let run = u64::from(number) * wanted / count;
         let first = (run * count).div_ceil(wanted);
         let length = ((run + 1) * count).div_ceil(wanted) - first;
         let hash = blake3::keyed_hash(&key, &run.to_le_bytes());
         let drawn = u64::from_le_bytes(*hash.as_bytes().first_chunk().expect("it has 32 bytes"));
         u64::from(number) == first + drawn % length
-    })
+    }
+}
+
+/// Bytes that nobody can foretell.
+fn random_key() -> io::Result<[u8; 32]> {
+    let mut key = [0; 32];
+    rustix::rand::getrandom(&mut key, rustix::rand::GetRandomFlags::empty())?;
+    Ok(key)
 }
 
 #[cfg(test)]
@@ -217,8 +222,9 @@ mod tests {
     fn as_many_tiles_are_chosen_as_are_wanted_and_each_may_be() {
         for (count, wanted) in [(1, 1), (7, 3), (96, 96), (1000, 31), (5, 9)] {
             let mut seen = vec![false; count as usize];
-            for _ in 0..300 {
-                let chosen = choose(TileShare::Some(wanted), count).unwrap();
+            for number in 0_u32..1000 {
+                let key = *blake3::hash(&number.to_le_bytes()).as_bytes();
+                let chosen = choose(TileShare::Some(wanted), count, key);
                 let tiles: Vec<u32> = (0..count).filter(|&tile| chosen(tile)).collect();
                 assert_eq!(tiles.len() as u32, wanted.min(count), "{count} {wanted}");
                 for &tile in &tiles {
@@ -227,7 +233,7 @@ mod tests {
             }
             assert!(seen.iter().all(|&seen| seen), "{count} {wanted}");
         }
-        let all = choose(TileShare::All, 64).unwrap();
+        let all = choose(TileShare::All, 64, [0; 32]);
         assert!((0..64).all(all));
     }
 }
