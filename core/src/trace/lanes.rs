@@ -29,25 +29,25 @@ pub(super) const MOST_RAYS: usize = LANES * GROUPS;
 #[derive(Debug, Clone, Copy)]
 #[repr(C, align(64))]
 pub(super) struct RayGroup {
+    /// In the order of the axes of the rays' [`Shear`].
+    pub(super) origin: [[f64; LANES]; 3],
+    pub(super) slopes: [[f64; LANES]; 3],
     pub(super) near_origin: [[f32; LANES]; 3],
     pub(super) far_origin: [[f32; LANES]; 3],
     pub(super) inverse: [[f32; LANES]; 3],
     pub(super) far_inverse: [[f32; LANES]; 3],
     pub(super) high: [f32; LANES],
-    /// In the order of the axes of the rays' [`Shear`].
-    pub(super) origin: [[f64; LANES]; 3],
-    pub(super) slopes: [[f64; LANES]; 3],
 }
 
 impl RayGroup {
     pub(super) const EMPTY: Self = Self {
+        origin: [[0.0; LANES]; 3],
+        slopes: [[0.0; LANES]; 3],
         near_origin: [[0.0; LANES]; 3],
         far_origin: [[0.0; LANES]; 3],
         inverse: [[0.0; LANES]; 3],
         far_inverse: [[0.0; LANES]; 3],
         high: [0.0; LANES],
-        origin: [[0.0; LANES]; 3],
-        slopes: [[0.0; LANES]; 3],
     };
 }
 
