@@ -12,6 +12,7 @@ mod boxes_x86;
 mod course;
 mod hit;
 pub(crate) mod kernels;
+mod lane_faces;
 mod lanes;
 mod packet;
 mod parallelepiped;
