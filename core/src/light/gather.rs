@@ -17,7 +17,7 @@ use crate::{
         ray_differential::SurfaceFootprint,
     },
     trace::{
-        batch::{OnProgress, trace},
+        batch::{OnProgress, Room, trace},
         ray::{Hit, Ray},
     },
 };
@@ -112,10 +112,11 @@ impl Gatherer {
         &mut self,
         view: &View<'_>,
         isa: Isa,
+        room: &mut Room,
         on_progress: OnProgress<'_>,
     ) -> ControlFlow<(), u64> {
         self.sources.clear();
-        trace(view, isa, &self.queue.rays, &mut self.hits, on_progress)?;
+        trace(view, isa, room, &self.queue.rays, &mut self.hits, on_progress)?;
         self.next.clear();
         for k in 0..self.queue.rays.len() {
             let (ray, hit, path) = (self.queue.rays[k], self.hits[k], self.queue.paths[k]);

@@ -26,7 +26,7 @@ use crate::{
     },
     tile::Size,
     trace::{
-        batch::{OnProgress, trace, trace_shadows},
+        batch::{OnProgress, Room, trace, trace_shadows},
         kernels::run_in_lanes,
         ray::{Hit, Ray},
     },
@@ -55,6 +55,7 @@ pub(super) struct Wavefront {
     next_queue: RayQueue,
     /// Samples that wait until those of the queue are done, with their rays.
     put_off: Vec<RayQueue>,
+    room: Room,
     hits: Vec<Hit>,
     points: Vec<Point>,
     shadow_rays: Vec<Ray>,
@@ -264,7 +265,7 @@ impl Wavefront {
                 let Some(later) = self.queue.split_samples() else { break };
                 self.put_off.push(later);
             }
-            trace(view, isa, &self.queue.rays, &mut self.hits, on_progress)?;
+            trace(view, isa, &mut self.room, &self.queue.rays, &mut self.hits, on_progress)?;
             ray_count += self.queue.rays.len() as u64;
             self.meet_all(view);
             if std::mem::take(&mut is_first) {
@@ -443,7 +444,7 @@ impl Wavefront {
         let mut ray_count = 0;
         self.gatherer.start(view, &self.points, &self.samples);
         for _ in 0..=MOST_CROSSINGS {
-            match self.gatherer.find_sources(view, isa, on_progress)? {
+            match self.gatherer.find_sources(view, isa, &mut self.room, on_progress)? {
                 0 => break,
                 count => ray_count += count,
             }
@@ -494,7 +495,8 @@ impl Wavefront {
             count += usize::from(height > 0.0 && !on_light.contains(&point.surface));
         }
         let (shadow_rays, arrivals) = (&shadow_rays[..count], &arrivals[..count]);
-        trace_shadows(view, isa, light, shadow_rays, &mut self.shares, on_progress)?;
+        let aim = (light, shadow_rays);
+        trace_shadows(view, isa, &mut self.room, aim, &mut self.shares, on_progress)?;
         for (&(point, arrival), &share) in arrivals.iter().zip(&self.shares) {
             self.points[point].light += share * arrival;
         }

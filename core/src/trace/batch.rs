@@ -36,16 +36,32 @@ pub(crate) type OnProgress<'a> = &'a mut dyn FnMut() -> ControlFlow<()>;
 /// tens of microseconds.
 pub(crate) const RAYS_A_REPORT: usize = 256;
 
+/// Room to trace in, kept from batch to batch: to clear it would cost as much as some rays.
+#[derive(Debug, Default)]
+pub(crate) struct Room(Box<Rooms>);
+
+#[derive(Debug, Default)]
+struct Rooms {
+    scratch: Scratch,
+    stack: Stack,
+    packet: Packet,
+    packet_stack: PacketStack,
+    /// The clear faces between rays and their lights: each with its ray's place, its rank and the share
+    /// of light that it lets through.
+    clear: Vec<(u16, u32, f64)>,
+}
+
 /// Finds what each ray meets first.
 pub(crate) fn trace(
     view: &View<'_>,
     isa: Isa,
+    Room(room): &mut Room,
     rays: &[Ray],
     hits: &mut Vec<Hit>,
     on_progress: OnProgress<'_>,
 ) -> ControlFlow<()> {
     hits.clear();
-    run_with_kernel(isa, view, &mut Trace { rays, hits, on_progress });
+    run_with_kernel(isa, view, &mut Trace { room, rays, hits, on_progress });
     stop_unless(hits.len() == rays.len())
 }
 
@@ -53,18 +69,14 @@ pub(crate) fn trace(
 pub(crate) fn trace_shadows(
     view: &View<'_>,
     isa: Isa,
-    light: &LightRecord,
-    rays: &[Ray],
+    Room(room): &mut Room,
+    (light, rays): (&LightRecord, &[Ray]),
     shares: &mut Vec<f64>,
     on_progress: OnProgress<'_>,
 ) -> ControlFlow<()> {
     shares.clear();
     let ending_on = view.coincident_surfaces(light);
-    if view.header.features.has_clear_shadows() {
-        run_with_kernel(isa, view, &mut ClearShadows { rays, ending_on, shares, on_progress });
-    } else {
-        run_with_kernel(isa, view, &mut Shadows { rays, ending_on, shares, on_progress });
-    }
+    run_with_kernel(isa, view, &mut Shadows { room, rays, ending_on, shares, on_progress });
     stop_unless(shares.len() == rays.len())
 }
 
@@ -141,6 +153,7 @@ impl Order {
 }
 
 struct Trace<'a> {
+    room: &'a mut Rooms,
     rays: &'a [Ray],
     hits: &'a mut Vec<Hit>,
     on_progress: OnProgress<'a>,
@@ -149,8 +162,7 @@ struct Trace<'a> {
 impl KernelWork<View<'_>> for Trace<'_> {
     #[inline(always)]
     fn run(&mut self, view: &View<'_>, kernel: impl BoxKernel) {
-        let (mut scratch, mut stack) = (Scratch::default(), Stack::default());
-        let (mut packet, mut packet_stack) = (Packet::new(), PacketStack::default());
+        let Rooms { scratch, stack, packet, packet_stack, .. } = &mut *self.room;
         for rays in self.rays.chunks(RAYS_A_REPORT) {
             if (self.on_progress)().is_break() {
                 return;
@@ -163,8 +175,8 @@ impl KernelWork<View<'_>> for Trace<'_> {
                     for &member in members {
                         let ray = &rays[usize::from(member)];
                         let mut nearest = Nearest::new(ray);
-                        visit(kernel, view, ray, &mut stack, |item, box_ray| {
-                            if nearest.meet(view, kernel, box_ray, item, &mut scratch) {
+                        visit(kernel, view, ray, stack, |item, box_ray| {
+                            if nearest.meet(view, kernel, box_ray, item, scratch) {
                                 Step::On(nearest.hit.t)
                             } else {
                                 Step::Past
@@ -175,10 +187,9 @@ impl KernelWork<View<'_>> for Trace<'_> {
                     continue;
                 }
                 packet.fill(kernel, &view.header.frame, rays, members);
-                let stacks = (&mut packet_stack, &mut stack);
-                let scratch = &mut scratch;
+                let scratch = &mut *scratch;
                 let mut meeting = NearestOfPacket { view, kernel, rays, members, hits, scratch };
-                visit_packet(kernel, view, &mut packet, stacks, &mut meeting);
+                visit_packet(kernel, view, packet, (packet_stack, stack), &mut meeting);
             }
         }
     }
@@ -242,8 +253,9 @@ impl<K: BoxKernel> Meeting for NearestOfPacket<'_, K> {
     }
 }
 
-/// Nothing lets light through: the first face decides.
+/// What lets no light through decides alone; of the faces that do each counts.
 struct Shadows<'a> {
+    room: &'a mut Rooms,
     rays: &'a [Ray],
     ending_on: &'a [Surface],
     shares: &'a mut Vec<f64>,
@@ -253,8 +265,7 @@ struct Shadows<'a> {
 impl KernelWork<View<'_>> for Shadows<'_> {
     #[inline(always)]
     fn run(&mut self, view: &View<'_>, kernel: impl BoxKernel) {
-        let (mut scratch, mut stack) = (Scratch::default(), Stack::default());
-        let (mut packet, mut packet_stack) = (Packet::new(), PacketStack::default());
+        let Rooms { scratch, stack, packet, packet_stack, clear } = &mut *self.room;
         for rays in self.rays.chunks(RAYS_A_REPORT) {
             if (self.on_progress)().is_break() {
                 return;
@@ -262,25 +273,58 @@ impl KernelWork<View<'_>> for Shadows<'_> {
             let first = self.shares.len();
             self.shares.resize(first + rays.len(), 1.0);
             let shares = &mut self.shares[first..];
+            clear.clear();
             for (members, go_together) in Order::new(kernel, rays, &view.header.frame).packets() {
-                let (scratch, ending_on) = (&mut scratch, self.ending_on);
-                let mut meeting =
-                    BlockedOfPacket { view, kernel, rays, members, ending_on, shares, scratch };
+                let shades = Shades {
+                    ending_on: self.ending_on,
+                    has_clear: view.header.features.has_clear_shadows(),
+                    shares,
+                    clear,
+                };
+                let scratch = &mut *scratch;
+                let mut meeting = BlockedOfPacket { view, kernel, rays, members, scratch, shades };
                 if go_together {
                     packet.fill(kernel, &view.header.frame, rays, members);
-                    let stacks = (&mut packet_stack, &mut stack);
-                    visit_packet(kernel, view, &mut packet, stacks, &mut meeting);
+                    visit_packet(kernel, view, packet, (packet_stack, stack), &mut meeting);
                     continue;
                 }
                 for (place, &member) in members.iter().enumerate() {
                     let ray = &rays[usize::from(member)];
                     let shear = Shear::new(ray.origin, ray.direction);
-                    visit(kernel, view, ray, &mut stack, |item, box_ray| {
+                    visit(kernel, view, ray, stack, |item, box_ray| {
                         meeting.ask(place, item, &shear, box_ray)
                     });
                 }
             }
+            // In an order that does not depend on the tree, for products round.
+            clear.sort_unstable_by_key(|&(member, rank, _)| (member, rank));
+            for &(member, _, share) in clear.iter() {
+                shares[usize::from(member)] *= share;
+            }
         }
+    }
+}
+
+/// What becomes of the light of shadow rays.
+struct Shades<'a> {
+    ending_on: &'a [Surface],
+    /// Whether some faces let light through.
+    has_clear: bool,
+    shares: &'a mut [f64],
+    clear: &'a mut Vec<(u16, u32, f64)>,
+}
+
+impl Shades<'_> {
+    /// A face is between a ray and its light; whether nothing of it is left.
+    #[inline(always)]
+    fn block(&mut self, view: &View<'_>, member: u16, rank: u32, face: Face) -> bool {
+        let share = if self.has_clear { face.material(view).transmittance() } else { 0.0 };
+        if share == 0.0 {
+            self.shares[usize::from(member)] = 0.0;
+        } else {
+            self.clear.push((member, rank, share));
+        }
+        share == 0.0
     }
 }
 
@@ -290,96 +334,62 @@ struct BlockedOfPacket<'a, K> {
     kernel: K,
     rays: &'a [Ray],
     members: &'a [u16],
-    ending_on: &'a [Surface],
-    shares: &'a mut [f64],
     scratch: &'a mut Scratch,
+    shades: Shades<'a>,
+}
+
+impl<K> BlockedOfPacket<'_, K> {
+    /// What an item that is no solid means if it is in the way so many times.
+    #[inline(always)]
+    fn block(&mut self, place: usize, item: Item, times: usize) -> Step {
+        let face = Face::whole(item);
+        let rank = if self.shades.has_clear { face.rank(self.view).unwrap_or(0) } else { 0 };
+        for _ in 0..times {
+            if self.shades.block(self.view, self.members[place], rank, face) {
+                return Step::Enough;
+            }
+        }
+        Step::Past
+    }
 }
 
 impl<K: BoxKernel> Meeting for BlockedOfPacket<'_, K> {
     #[inline(always)]
     fn cross(&mut self, place: usize, item: Item, t: f64) -> Step {
-        let member = usize::from(self.members[place]);
-        if is_between(self.view, &self.rays[member], self.ending_on, item, t) {
-            self.shares[member] = 0.0;
-            return Step::Enough;
-        }
-        Step::Past
+        let ray = &self.rays[usize::from(self.members[place])];
+        let is_between = is_between(self.view, ray, self.shades.ending_on, item, t);
+        self.block(place, item, usize::from(is_between))
     }
 
     #[inline(always)]
     fn is_plain(&self, item: Item) -> bool {
-        self.ending_on.is_empty() || !self.ending_on.contains(&Face::whole(item).surface(self.view))
+        let ending_on = self.shades.ending_on;
+        ending_on.is_empty() || !ending_on.contains(&Face::whole(item).surface(self.view))
     }
 
     #[inline(always)]
-    fn cross_sphere(&mut self, place: usize, _item: Item, ends: [f64; 2]) -> Step {
-        let member = usize::from(self.members[place]);
-        if ends.iter().any(|&t| t > 0.0 && t < self.rays[member].reach) {
-            self.shares[member] = 0.0;
-            return Step::Enough;
-        }
-        Step::Past
+    fn cross_sphere(&mut self, place: usize, item: Item, ends: [f64; 2]) -> Step {
+        let reach = self.rays[usize::from(self.members[place])].reach;
+        let inner = ends.iter().filter(|&&t| t > 0.0 && t < reach);
+        self.block(place, item, inner.count())
     }
 
     #[inline(always)]
     fn cross_quadrangle(&mut self, place: usize, item: Item) -> Step {
-        let member = usize::from(self.members[place]);
-        if is_quadrangle_between(self.view, &self.rays[member], item) {
-            self.shares[member] = 0.0;
-            return Step::Enough;
-        }
-        Step::Past
+        let ray = &self.rays[usize::from(self.members[place])];
+        self.block(place, item, usize::from(is_quadrangle_between(self.view, ray, item)))
     }
 
     #[inline(always)]
     fn ask(&mut self, place: usize, item: Item, shear: &Shear, box_ray: &BoxRay) -> Step {
-        let member = usize::from(self.members[place]);
-        let share = &mut self.shares[member];
-        let aim = (&self.rays[member], shear, box_ray, self.ending_on);
-        between(self.view, self.kernel, aim, item, self.scratch, |_, _| {
-            *share = 0.0;
-            true
+        let Self { view, kernel, scratch, shades, .. } = self;
+        let member = self.members[place];
+        let aim = (&self.rays[usize::from(member)], shear, box_ray, shades.ending_on);
+        let mut is_blocked = false;
+        between(view, *kernel, aim, item, scratch, |rank, part| {
+            is_blocked |= shades.block(view, member, rank, Face { item, part });
+            is_blocked
         });
-        if *share == 0.0 { Step::Enough } else { Step::Past }
-    }
-}
-
-/// Every face counts.
-struct ClearShadows<'a> {
-    rays: &'a [Ray],
-    ending_on: &'a [Surface],
-    shares: &'a mut Vec<f64>,
-    on_progress: OnProgress<'a>,
-}
-
-impl KernelWork<View<'_>> for ClearShadows<'_> {
-    #[inline(always)]
-    fn run(&mut self, view: &View<'_>, kernel: impl BoxKernel) {
-        let (mut scratch, mut stack) = (Scratch::default(), Stack::default());
-        let mut crossed: Vec<(u32, f64)> = Vec::new();
-        for rays in self.rays.chunks(RAYS_A_REPORT) {
-            if (self.on_progress)().is_break() {
-                return;
-            }
-            for ray in rays {
-                let shear = Shear::new(ray.origin, ray.direction);
-                crossed.clear();
-                let mut is_blocked = false;
-                visit(kernel, view, ray, &mut stack, |item, box_ray| {
-                    let aim = (ray, &shear, box_ray, self.ending_on);
-                    between(view, kernel, aim, item, &mut scratch, |rank, part| {
-                        let share = Face { item, part }.material(view).transmittance();
-                        is_blocked |= share == 0.0;
-                        crossed.push((rank, share));
-                        is_blocked
-                    });
-                    if is_blocked { Step::Enough } else { Step::Past }
-                });
-                // In an order that does not depend on the tree, for products round.
-                crossed.sort_unstable_by_key(|&(rank, _)| rank);
-                let share = crossed.iter().fold(1.0, |product, (_, share)| product * share);
-                self.shares.push(if is_blocked { 0.0 } else { share });
-            }
-        }
+        if is_blocked { Step::Enough } else { Step::Past }
     }
 }

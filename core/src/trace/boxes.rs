@@ -7,19 +7,24 @@
 use super::{
     box_ray::BoxRay,
     lanes::{self, Beam, Crossings, GROUPS, LANES, RayGroup, Turn, larger, smaller},
+    parallelepiped::PlaneCrossings,
     ray::Ray,
 };
-use crate::prepared::node::{Frame, Node};
+use crate::prepared::{
+    node::{Frame, Node},
+    record::BoxPlanes,
+};
 
 /// Tests a ray against a node's eight boxes: the distances at which it enters them, and which of
 /// them it meets, a bit each. Distances of boxes that are not met mean nothing.
 ///
 /// A kernel is a value, and only a CPU that runs it has one.
 pub(super) trait BoxKernel: Copy {
-    /// The kernel for code that is compiled for every CPU of the kind.
-    type Plain: BoxKernel;
-
-    fn plain(self) -> Self::Plain;
+    /// Does work that is compiled for the kernel's instruction set: all that is inlined into it.
+    #[inline(always)]
+    fn run<Input>(self, input: &Input, work: &mut impl KernelWork<Input>) {
+        work.run(input, self);
+    }
 
     fn test(self, node: &Node, ray: &BoxRay) -> ([f32; 8], u32);
 
@@ -67,6 +72,35 @@ pub(super) trait BoxKernel: Copy {
     ) -> Crossings {
         lanes::cross(groups, corners, mask, distances)
     }
+
+    /// Where the line of a ray enters the last plane of a parallelepiped and leaves the first one:
+    /// before it enters, if it passes by. With it comes the least cosine between the line and a
+    /// normal. A plane that the ray leaves is `left_at` a distance that is known.
+    #[inline(always)]
+    fn cross_box(self, ray: &Ray, left_at: f64, planes: &BoxPlanes) -> ([f64; 2], f64) {
+        PlaneCrossings::new(ray, left_at, planes).cross()
+    }
+
+    /// The first of these faces that is entered or left at `t`.
+    #[inline(always)]
+    fn face_at(self, (ray, left_at): (&Ray, f64), planes: &BoxPlanes, t: f64, enters: bool) -> u32 {
+        PlaneCrossings::new(ray, left_at, planes).face(t, enters)
+    }
+
+    /// Takes the numbers that are `t` out of four, so that they become infinite: a bit for each.
+    /// `least` takes in the others.
+    #[inline(always)]
+    fn take_out(self, four: &mut [f64; 4], t: f64, least: &mut [f64; 4]) -> u32 {
+        let mut taken = 0;
+        for (lane, (number, least)) in four.iter_mut().zip(least).enumerate() {
+            if *number == t {
+                *number = f64::INFINITY;
+                taken |= 1 << lane;
+            }
+            *least = least.min(*number);
+        }
+        taken
+    }
 }
 
 /// The kernel in plain Rust, for every CPU.
@@ -74,13 +108,6 @@ pub(super) trait BoxKernel: Copy {
 pub(super) struct ScalarBoxes;
 
 impl BoxKernel for ScalarBoxes {
-    type Plain = Self;
-
-    #[inline(always)]
-    fn plain(self) -> Self {
-        self
-    }
-
     #[inline(always)]
     fn test(self, node: &Node, ray: &BoxRay) -> ([f32; 8], u32) {
         // NaN: an origin on the plane of a box that the ray runs along.

@@ -10,11 +10,14 @@ use std::arch::x86_64::{
 use super::{
     box_ray::BoxRay,
     boxes::{BoxKernel, KernelWork},
-    boxes_x86::{Avx2Boxes, Sse2Boxes},
+    boxes_x86::Avx2Boxes,
     lanes::{Beam, Crossings, GROUPS, LANES, RayGroup, Turn},
     ray::Ray,
 };
-use crate::prepared::node::{Frame, Node};
+use crate::prepared::{
+    node::{Frame, Node},
+    record::BoxPlanes,
+};
 
 /// The kernel with AVX-512 (F and VL). [`Avx512Boxes::detect`] makes it on CPUs that have these, and
 /// nothing else does.
@@ -28,9 +31,10 @@ impl Avx512Boxes {
             && std::arch::is_x86_feature_detected!("avx512vl");
         Avx2Boxes::detect().filter(|_| has_all).map(Self)
     }
+}
 
-    /// Does work that is compiled for AVX-512 together with the kernel.
-    pub(super) fn run<Input>(self, input: &Input, work: &mut impl KernelWork<Input>) {
+impl BoxKernel for Avx512Boxes {
+    fn run<Input>(self, input: &Input, work: &mut impl KernelWork<Input>) {
         #[target_feature(enable = "avx2,avx512f,avx512vl")]
         fn run_compiled_for_avx512<Input>(
             kernel: Avx512Boxes,
@@ -42,14 +46,20 @@ impl Avx512Boxes {
         // SAFETY: a value of this type says that the CPU has AVX-512, and the one in it AVX2.
         unsafe { run_compiled_for_avx512(self, input, work) }
     }
-}
-
-impl BoxKernel for Avx512Boxes {
-    type Plain = Sse2Boxes;
 
     #[inline(always)]
-    fn plain(self) -> Sse2Boxes {
-        self.0.plain()
+    fn cross_box(self, ray: &Ray, left_at: f64, planes: &BoxPlanes) -> ([f64; 2], f64) {
+        self.0.cross_box(ray, left_at, planes)
+    }
+
+    #[inline(always)]
+    fn face_at(self, rays: (&Ray, f64), planes: &BoxPlanes, t: f64, enters: bool) -> u32 {
+        self.0.face_at(rays, planes, t, enters)
+    }
+
+    #[inline(always)]
+    fn take_out(self, four: &mut [f64; 4], t: f64, least: &mut [f64; 4]) -> u32 {
+        self.0.take_out(four, t, least)
     }
 
     #[inline(always)]

@@ -20,9 +20,13 @@ use super::{
     box_ray::{BoxRay, FAR, NEAR, NEAR_FRAME},
     boxes::{BoxKernel, KernelWork},
     lanes::{Beam, CLASSES, Crossings, GROUPS, LANES, LEAST_COMPONENT, RayGroup, Turn},
+    parallelepiped_x86,
     ray::Ray,
 };
-use crate::prepared::node::{Frame, Node};
+use crate::prepared::{
+    node::{Frame, Node},
+    record::BoxPlanes,
+};
 
 /// The kernel with SSE2, four boxes at a time. Every x86-64 CPU has it.
 #[derive(Debug, Clone, Copy)]
@@ -35,13 +39,6 @@ impl Sse2Boxes {
 }
 
 impl BoxKernel for Sse2Boxes {
-    type Plain = Self;
-
-    #[inline(always)]
-    fn plain(self) -> Self {
-        self
-    }
-
     #[inline(always)]
     fn test(self, node: &Node, ray: &BoxRay) -> ([f32; 8], u32) {
         let mut distances = [0.0; 8];
@@ -69,6 +66,11 @@ impl BoxKernel for Sse2Boxes {
         }
         (distances, mask)
     }
+
+    #[inline(always)]
+    fn cross_box(self, ray: &Ray, left_at: f64, planes: &BoxPlanes) -> ([f64; 2], f64) {
+        parallelepiped_x86::cross_box(ray, left_at, planes)
+    }
 }
 
 /// The kernel with AVX2, all eight boxes at once. [`Avx2Boxes::detect`] makes it on CPUs that have
@@ -81,9 +83,10 @@ impl Avx2Boxes {
     pub(super) fn detect() -> Option<Self> {
         std::arch::is_x86_feature_detected!("avx2").then_some(Self(()))
     }
+}
 
-    /// Does work that is compiled for AVX2 together with the kernel.
-    pub(super) fn run<Input>(self, input: &Input, work: &mut impl KernelWork<Input>) {
+impl BoxKernel for Avx2Boxes {
+    fn run<Input>(self, input: &Input, work: &mut impl KernelWork<Input>) {
         #[target_feature(enable = "avx2")]
         fn run_compiled_for_avx2<Input>(
             kernel: Avx2Boxes,
@@ -95,14 +98,30 @@ impl Avx2Boxes {
         // SAFETY: a value of this type says that the CPU has AVX2.
         unsafe { run_compiled_for_avx2(self, input, work) }
     }
-}
-
-impl BoxKernel for Avx2Boxes {
-    type Plain = Sse2Boxes;
 
     #[inline(always)]
-    fn plain(self) -> Sse2Boxes {
-        Sse2Boxes(())
+    fn cross_box(self, ray: &Ray, left_at: f64, planes: &BoxPlanes) -> ([f64; 2], f64) {
+        parallelepiped_x86::cross_box_with_avx2(self, ray, left_at, planes)
+    }
+
+    #[inline(always)]
+    fn face_at(self, (ray, left_at): (&Ray, f64), planes: &BoxPlanes, t: f64, enters: bool) -> u32 {
+        parallelepiped_x86::face_at_with_avx2(self, (ray, left_at), planes, t, enters)
+    }
+
+    #[inline(always)]
+    fn take_out(self, four: &mut [f64; 4], t: f64, least: &mut [f64; 4]) -> u32 {
+        // SAFETY: a value of this type says that the CPU has AVX2. Loads and stores are of arrays of
+        // exactly 4 numbers.
+        unsafe {
+            let numbers = _mm256_loadu_pd(four.as_ptr());
+            let is_taken = _mm256_cmp_pd::<_CMP_EQ_OQ>(numbers, _mm256_set1_pd(t));
+            let left = _mm256_blendv_pd(numbers, _mm256_set1_pd(f64::INFINITY), is_taken);
+            _mm256_storeu_pd(four.as_mut_ptr(), left);
+            let least_yet = _mm256_loadu_pd(least.as_ptr());
+            _mm256_storeu_pd(least.as_mut_ptr(), _mm256_min_pd(left, least_yet));
+            _mm256_movemask_pd(is_taken) as u32
+        }
     }
 
     #[inline(always)]

@@ -3,7 +3,7 @@
 use glam::DVec3;
 
 use super::{
-    parallelepiped::{PlaneCrossings, cross_box},
+    boxes::BoxKernel,
     quadrangle::toward_plane,
     ray::Ray,
     sphere::{hit_sphere, hit_sphere_again},
@@ -56,7 +56,7 @@ pub(super) enum Pin {
 /// A ray on its way through a solid. It starts near the solid, wherever the ray does: so rounding is
 /// as fine as the solid.
 pub(super) struct Course<'a> {
-    view: &'a View<'a>,
+    pub(super) view: &'a View<'a>,
     pub(super) solid: &'a SolidRecord,
     pub(super) nodes: &'a [SolidNodeRecord],
     pub(super) leaves: &'a [LeafRecord],
@@ -71,6 +71,7 @@ pub(super) struct Course<'a> {
 }
 
 impl<'a> Course<'a> {
+    #[inline(always)]
     pub(super) fn new(
         view: &'a View<'a>,
         solid: &'a SolidRecord,
@@ -219,13 +220,17 @@ impl<'a> Course<'a> {
     /// The stretch of the line that is inside a leaf, to the bit as [`Self::meet_leaf`] has it, or
     /// [`NOWHERE`]; `None` where the leaf is grazed or thin, so that doubts might count.
     #[inline(always)]
-    pub(super) fn sure_stretch(&self, leaf: &LeafRecord) -> Option<[f64; 2]> {
+    pub(super) fn sure_stretch(
+        &self,
+        kernel: impl BoxKernel,
+        leaf: &LeafRecord,
+    ) -> Option<[f64; 2]> {
         let (stretch, is_steep) = if leaf.is_sphere() {
             let stretch = self.sphere_stretch(leaf);
             (stretch, stretch[1] - stretch[0] >= STEEP * 2.0 * leaf.radius)
         } else {
             let planes = &self.view.box_planes[leaf.surface as usize];
-            let (stretch, cosine) = cross_box(&self.near, -self.start, planes);
+            let (stretch, cosine) = kernel.cross_box(&self.near, -self.start, planes);
             (stretch, cosine >= STEEP)
         };
         let [enter, leave] = stretch;
@@ -253,13 +258,18 @@ impl<'a> Course<'a> {
 
     /// The crossing at an end of a leaf's sure stretch, at `t` of the course.
     #[inline(always)]
-    pub(super) fn sure_crossing(&self, number: u32, t: f64, enters: bool) -> Crossing {
+    pub(super) fn sure_crossing(
+        &self,
+        kernel: impl BoxKernel,
+        number: u32,
+        (t, enters): (f64, bool),
+    ) -> Crossing {
         let leaf = &self.leaves[number as usize];
         let face = if leaf.is_sphere() {
             0
         } else {
             let planes = &self.view.box_planes[leaf.surface as usize];
-            PlaneCrossings::new(&self.near, -self.start, planes).face(t, enters)
+            kernel.face_at((&self.near, -self.start), planes, t, enters)
         };
         Crossing { t: self.start + t, part: Part::new(number, face) }
     }

@@ -4,7 +4,7 @@ use glam::DVec3;
 
 use super::{
     box_ray::BoxRay,
-    boxes::BoxKernel,
+    boxes::{BoxKernel, KernelWork},
     course::Crossing,
     quadrangle::{hit_chord, hit_plane, is_inside},
     ray::{Hit, Ray, Shear},
@@ -15,7 +15,7 @@ use super::{
 use crate::prepared::{
     face::{Face, Part},
     layout::View,
-    record::{Item, Kind, Surface},
+    record::{Item, Kind, SolidRecord, Surface},
 };
 
 /// The search for the nearest face.
@@ -45,7 +45,7 @@ impl<'a> Nearest<'a> {
         let met = match item.kind() {
             Some(Kind::Solid) => {
                 let rays = (self.ray, box_ray);
-                meet_solid(view, kernel.plain(), rays, item.index(), self.hit.t, scratch)
+                meet_solid(view, kernel, rays, item.index(), self.hit.t, scratch)
             }
             _ => meet(view, self.ray, &self.shear, item),
         };
@@ -192,8 +192,38 @@ pub(super) fn is_quadrangle_between(view: &View<'_>, ray: &Ray, item: Item) -> b
     meet_quadrangle(view, ray, item).is_some_and(|(t, ..)| t < ray.reach)
 }
 
-/// What [`meet`] tells, for a solid, up to `reach`.
+/// The crossings of a solid up to `reach`, which `take` is told of.
+struct CrossSolid<'a, F> {
+    solid: &'a SolidRecord,
+    ray: &'a Ray,
+    box_ray: &'a BoxRay,
+    ending_on: &'a [Surface],
+    reach: f64,
+    scratch: &'a mut Scratch,
+    take: F,
+}
+
+impl<F: FnMut(Crossing) -> bool> KernelWork<View<'_>> for CrossSolid<'_, F> {
+    #[inline(always)]
+    fn run(&mut self, view: &View<'_>, kernel: impl BoxKernel) {
+        let Self { solid, ray, box_ray, ending_on, reach, scratch, take } = self;
+        scratch.cross((view, solid), kernel, (ray, box_ray), ending_on, *reach, take);
+    }
+}
+
+/// Crosses a solid: in a function of its own, for it is long, with all that it calls compiled for
+/// the kernel.
 #[inline(never)]
+fn cross_solid<F: FnMut(Crossing) -> bool>(
+    kernel: impl BoxKernel,
+    mut work: CrossSolid<'_, F>,
+    view: &View<'_>,
+) {
+    kernel.run(view, &mut work);
+}
+
+/// What [`meet`] tells, for a solid, up to `reach`.
+#[inline(always)]
 fn meet_solid(
     view: &View<'_>,
     kernel: impl BoxKernel,
@@ -204,13 +234,15 @@ fn meet_solid(
 ) -> Option<(f64, u32, Part)> {
     let solid = &view.solids[index];
     let mut met = None;
-    scratch.cross((view, solid), kernel, (ray, box_ray), &[], reach, |Crossing { t, part }| {
+    let take = |Crossing { t, part }| {
         let rank = part.rank(solid);
         let is_met = t > 0.0
             || (rank > ray.after && part.leaf_of(view, solid).surface(part.face()) == ray.leaving);
         met = is_met.then_some((t, rank, part));
         is_met
-    });
+    };
+    let work = CrossSolid { solid, ray, box_ray, ending_on: &[], reach, scratch, take };
+    cross_solid(kernel, work, view);
     met
 }
 
@@ -233,8 +265,11 @@ pub(super) fn between(
             let take = |Crossing { t, part }: Crossing| {
                 t > 0.0 && t < ray.reach && cross(part.rank(solid), part)
             };
-            let rays = (ray, box_ray);
-            scratch.cross((view, solid), kernel.plain(), rays, ending_on, ray.reach, take);
+            cross_solid(
+                kernel,
+                CrossSolid { solid, ray, box_ray, ending_on, reach: ray.reach, scratch, take },
+                view,
+            );
         }
         Some(Kind::Sphere) => {
             let sphere = &view.spheres[index];

@@ -180,7 +180,7 @@ mod tests {
             let all = rays.clone();
             let class = class_of(&rays[0], &frame);
             rays.retain(|ray| class < CLASSES as u64 && class_of(ray, &frame) == class);
-            let mut packet = Packet::new();
+            let mut packet = Packet::default();
             if !rays.is_empty() {
                 let members: Vec<u16> = (0..rays.len() as u16).collect();
                 packet.fill(ScalarBoxes, &frame, &rays, &members);

@@ -27,6 +27,7 @@ use crate::prepared::{
 const FEW: u32 = 2;
 
 /// Up to [`MOST_RAYS`] rays of one class.
+#[derive(Debug)]
 pub(super) struct Packet {
     pub(super) groups: [RayGroup; GROUPS],
     pub(super) beam: Beam,
@@ -38,6 +39,7 @@ pub(super) struct Packet {
 }
 
 /// Children that wait, each with where it begins and the rays that enter it.
+#[derive(Debug)]
 pub(super) struct PacketStack([(f32, Child, u64); STACK]);
 
 impl Default for PacketStack {
@@ -97,9 +99,9 @@ pub(super) trait Meeting {
     fn ask(&mut self, place: usize, item: Item, shear: &Shear, box_ray: &BoxRay) -> Step;
 }
 
-impl Packet {
+impl Default for Packet {
     /// A packet of no rays.
-    pub(super) fn new() -> Self {
+    fn default() -> Self {
         Self {
             groups: [RayGroup::EMPTY; GROUPS],
             beam: Beam::EMPTY,
@@ -113,7 +115,9 @@ impl Packet {
             alive: 0,
         }
     }
+}
 
+impl Packet {
     /// Takes in the `members` of `rays`, which are of one class: at least one.
     #[inline(always)]
     pub(super) fn fill(

@@ -3,17 +3,6 @@
 use super::ray::Ray;
 use crate::prepared::record::BoxPlanes;
 
-/// Finds where the line of a ray enters the last plane and leaves the first one: before it enters,
-/// if it passes by. With it comes the least cosine between the line and a normal. A plane that the
-/// ray leaves is `left_at` a distance that is known.
-#[inline(always)]
-pub(super) fn cross_box(ray: &Ray, left_at: f64, planes: &BoxPlanes) -> ([f64; 2], f64) {
-    #[cfg(target_arch = "x86_64")]
-    return super::parallelepiped_x86::cross_box(ray, left_at, planes);
-    #[cfg(not(target_arch = "x86_64"))]
-    return PlaneCrossings::new(ray, left_at, planes).cross();
-}
-
 /// Where the line of a ray crosses the six planes, and how fast it goes outward there.
 pub(super) struct PlaneCrossings {
     t: [f64; 6],
@@ -21,6 +10,7 @@ pub(super) struct PlaneCrossings {
 }
 
 impl PlaneCrossings {
+    #[inline(always)]
     pub(super) fn new(ray: &Ray, left_at: f64, planes: &BoxPlanes) -> Self {
         let leaving = f64::from(ray.leaving.0);
         let (o, d) = (ray.origin.to_array(), ray.direction.to_array());
@@ -37,8 +27,8 @@ impl PlaneCrossings {
         Self { t, along }
     }
 
-    /// What [`cross_box`] finds.
-    #[cfg(any(test, not(target_arch = "x86_64")))]
+    /// What `BoxKernel::cross_box` finds.
+    #[inline(always)]
     pub(super) fn cross(&self) -> ([f64; 2], f64) {
         let (mut stretch, mut least) = ([f64::NEG_INFINITY, f64::INFINITY], f64::INFINITY);
         for (&t, &along) in self.t.iter().zip(&self.along) {
@@ -65,10 +55,28 @@ mod tests {
     use rtfarm_oracle::random::Random;
 
     use super::*;
-    use crate::prepared::record::{PlaneIndex, PlaneRecord};
+    use crate::{
+        isa::Isa,
+        prepared::record::{PlaneIndex, PlaneRecord},
+        trace::{
+            boxes::{BoxKernel, KernelWork},
+            kernels::run_with_kernel,
+        },
+    };
+
+    /// What a kernel finds: the stretch, the least cosine, and the faces at both ends.
+    type Found = ([f64; 2], f64, [u32; 2]);
+
+    impl KernelWork<(Ray, f64, BoxPlanes)> for Option<Found> {
+        fn run(&mut self, (ray, left_at, planes): &(Ray, f64, BoxPlanes), kernel: impl BoxKernel) {
+            let (stretch, least) = kernel.cross_box(ray, *left_at, planes);
+            let face = |end: usize| kernel.face_at((ray, *left_at), planes, stretch[end], end == 0);
+            *self = Some((stretch, least, [face(0), face(1)]));
+        }
+    }
 
     #[test]
-    fn instructions_for_two_faces_give_the_same_numbers() {
+    fn every_kernel_finds_the_same_stretch_and_faces() {
         let random = &mut Random::new(5);
         let (mut crossed, mut along_faces) = (0, 0);
         for _ in 0..20_000 {
@@ -95,9 +103,16 @@ mod tests {
                 after: Ray::NOTHING_AHEAD,
             };
             let left_at = random.between(-1.0, 1.0);
-            let (stretch, least) = cross_box(&ray, left_at, &planes);
-            let expected = PlaneCrossings::new(&ray, left_at, &planes).cross();
-            assert_eq!((stretch, least), expected, "{ray:?}");
+            let input = (ray, left_at, planes);
+            let find = |isa| {
+                let mut found = None;
+                run_with_kernel(isa, &input, &mut found);
+                found.expect("the kernel ran")
+            };
+            let (stretch, least, faces) = find(Isa::Scalar);
+            for isa in Isa::ALL.into_iter().filter(|isa| isa.is_supported()) {
+                assert_eq!(find(isa), (stretch, least, faces), "{isa}: {ray:?}");
+            }
             crossed += u32::from(stretch[0] < stretch[1]);
             along_faces += u32::from(least == 0.0);
         }

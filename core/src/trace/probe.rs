@@ -5,7 +5,7 @@ use std::ops::ControlFlow;
 use glam::DVec3;
 
 use super::{
-    batch::trace,
+    batch::{Room, trace},
     box_ray::BoxRay,
     boxes::ScalarBoxes,
     hit::{Nearest, between},
@@ -105,7 +105,7 @@ impl<B: AsRef<[u8]>> Probing for PreparedScene<B> {
         let rays: Vec<Ray> = probes.iter().map(|probe| to_ray(&view, probe)).collect();
         let mut hits = Vec::with_capacity(rays.len());
         let go_on = &mut || ControlFlow::Continue(());
-        let _ = trace(&view, isa, &rays, &mut hits, go_on);
+        let _ = trace(&view, isa, &mut Room::default(), &rays, &mut hits, go_on);
         hits.iter().map(|hit| from_hit(&view, hit)).collect()
     }
 

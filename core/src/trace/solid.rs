@@ -58,6 +58,7 @@ impl Scratch {
     /// Calls `take` for the crossings of the solid's surface from the ray's start up to `reach`, in
     /// order, until it says that it has enough. A surface that the ray leaves is crossed at 0, and
     /// one that it ends on (`ending_on`) at the ray's own reach.
+    #[inline(always)]
     pub(super) fn cross(
         &mut self,
         (view, solid): (&View<'_>, &SolidRecord),
@@ -70,27 +71,57 @@ impl Scratch {
         let course = Course::new(view, solid, ray, ending_on);
         let reach = reach - course.start;
         let margin = solid.margin;
-        self.waiting.clear();
-        self.touched.clear();
         let leaf_count = course.leaves.len();
-        let box_ray = if leaf_count > FEW_LEAVES {
-            self.waiting.push((f32::NEG_INFINITY, Child::inner(solid.first_box as usize)));
-            let stretch = [-course.start - 2.0 * margin, reach + 2.0 * margin];
-            Some(box_ray.in_frame(course.near.origin, stretch, &solid.frame))
+        let has_few = leaf_count <= FEW_LEAVES;
+        let box_ray = if has_few {
+            BoxRay::NOWHERE
         } else {
-            self.touched.extend(0..leaf_count as u32);
-            None
+            let stretch = [-course.start - 2.0 * margin, reach + 2.0 * margin];
+            box_ray.in_frame(course.near.origin, stretch, &solid.frame)
         };
-        let may_walk = course.nodes.len() <= SolidNodeRecord::BITS && ending_on.is_empty();
         // What comes up to here was told, or does not count.
         let mut told = -course.start - margin;
+        if course.nodes.len() > SolidNodeRecord::BITS || !ending_on.is_empty() {
+            self.waiting.clear();
+            self.touched.clear();
+            if has_few {
+                self.touched.extend(0..leaf_count as u32);
+            } else {
+                self.waiting.push((f32::NEG_INFINITY, Child::inner(solid.first_box as usize)));
+            }
+            return self.join_in_looks(&course, kernel, &box_ray, (told, reach), &mut take);
+        }
+        let touched = if has_few {
+            (1 << leaf_count) - 1
+        } else {
+            touch_few_leaves(&course, kernel, &box_ray)
+        };
+        if touched == 0 {
+            return;
+        }
+        let walked = self.walk.tell(kernel, &course, touched, (&mut told, reach), &mut take);
+        if walked == Walked::Unsure {
+            self.touched.clear();
+            self.touched.extend((0..leaf_count as u32).filter(|leaf| touched >> leaf & 1 == 1));
+            self.join_and_tell(&course, told, (&mut { reach }, reach), &mut take);
+        }
+    }
+
+    /// Tells of the crossings after `told` and up to `reach` in looks that each take in more leaves.
+    #[inline(always)]
+    fn join_in_looks(
+        &mut self,
+        course: &Course<'_>,
+        kernel: impl BoxKernel,
+        box_ray: &BoxRay,
+        (mut told, reach): (f64, f64),
+        take: &mut dyn FnMut(Crossing) -> bool,
+    ) {
         let mut enough = FIRST_LOOK;
         loop {
             let mut known = reach;
-            if let Some(box_ray) = &box_ray
-                && let Some(near) = self.touch_leaves(view, kernel, box_ray, enough)
-            {
-                known = (box_ray.distance(near) - 3.0 * margin).min(reach);
+            if let Some(near) = self.touch_leaves(course.view, kernel, box_ray, enough) {
+                known = (box_ray.distance(near) - 3.0 * course.solid.margin).min(reach);
             }
             if self.touched.is_empty() {
                 return;
@@ -98,16 +129,7 @@ impl Scratch {
             if !self.touched.is_sorted() {
                 self.touched.sort_unstable();
             }
-            let walked = if may_walk {
-                self.walk.tell(&course, &self.touched, (&mut told, known), &mut take)
-            } else {
-                Walked::Unsure
-            };
-            let has_enough = match walked {
-                Walked::Enough => true,
-                Walked::Through => false,
-                Walked::Unsure => self.join_and_tell(&course, told, (&mut known, reach), &mut take),
-            };
+            let has_enough = self.join_and_tell(course, told, (&mut known, reach), take);
             if has_enough || self.waiting.is_empty() {
                 return;
             }
@@ -142,6 +164,7 @@ impl Scratch {
 
     /// Adds leaves that the ray touches, until there are `enough`; where the first of the others
     /// may begin, if there are more.
+    #[inline(always)]
     fn touch_leaves(
         &mut self,
         view: &View<'_>,
@@ -396,6 +419,30 @@ impl Scratch {
         }
         count
     }
+}
+
+/// The leaves whose boxes the ray touches, a bit each, of a solid of at most
+/// [`SolidNodeRecord::BITS`] nodes. Its hierarchy has fewer than that, too.
+#[inline(always)]
+fn touch_few_leaves(course: &Course<'_>, kernel: impl BoxKernel, box_ray: &BoxRay) -> u64 {
+    let bit = |index: usize| 1_u64.checked_shl(index as u32).unwrap_or(0);
+    let first = course.solid.first_box as usize;
+    let (mut touched, mut waiting) = (0, 1_u64);
+    while waiting != 0 {
+        let node = &course.view.solid_boxes[first + waiting.trailing_zeros() as usize];
+        waiting &= waiting - 1;
+        let (_, mut mask) = kernel.test(node, box_ray);
+        while mask != 0 {
+            let child = node.children[mask.trailing_zeros() as usize & 7];
+            mask &= mask - 1;
+            if child.is_leaf() {
+                touched |= bit(child.items().start);
+            } else {
+                waiting |= bit(child.node() - first);
+            }
+        }
+    }
+    touched
 }
 
 /// Sorts ends by where they begin. Few are many times faster sorted so; many are rare.
@@ -772,5 +819,23 @@ mod tests {
         }
         eprintln!("{crossed} crossings of large solids");
         assert!(crossed > 10_000);
+    }
+
+    #[test]
+    fn a_ray_through_all_leaves_of_a_solid_with_a_bit_for_each_changes_no_bit() {
+        let mut crossed = 0;
+        for operands in [31, 32, 33, 63] {
+            let sphere = |primitive: u32| {
+                let radius = 1.0 + f64::from(primitive) / 64.0;
+                SolidNode::Sphere(Sphere { center: DVec3::ZERO, radius, material: 0, primitive })
+            };
+            let operation = Operation::Union;
+            let mut nodes: Vec<SolidNode> = (0..operands).map(sphere).collect();
+            nodes.push(SolidNode::Operation { operation, operands });
+            let solid = Solid { nodes, primitive: 0 };
+            let what = format!("{operands} nested spheres");
+            crossed += check_solid(&mut random(9), &solid, Style::Plain, 50, &what);
+        }
+        assert!(crossed > 100, "{crossed}");
     }
 }

@@ -4,9 +4,10 @@
 //! node of the tree that the ray is inside. Doubts do not count here: where they might, the walk is
 //! not sure and says so. docs/proof.md says why all others tell what the plain evaluation does.
 
-use std::ops::Range;
-
-use super::course::{Course, Crossing};
+use super::{
+    boxes::BoxKernel,
+    course::{Course, Crossing},
+};
 use crate::prepared::record::{NO_NODE, SolidNodeKind, SolidNodeRecord};
 
 /// What became of a walk.
@@ -23,7 +24,6 @@ pub(super) enum Walked {
 /// Where the ray enters or leaves a leaf.
 #[derive(Debug, Clone, Copy)]
 struct Event {
-    t: f64,
     leaf: u32,
     enters: bool,
 }
@@ -41,14 +41,17 @@ impl Change {
     }
 }
 
-/// The most leaves of a solid that is walked through, with two ends each.
-const MOST_EVENTS: usize = SolidNodeRecord::BITS + 2;
+/// The most leaves that are walked through: an end of each has a bit in 64.
+const MOST_LEAVES: usize = 32;
 
 /// Room for a walk.
 #[derive(Debug)]
 pub(super) struct Walk {
-    /// In the order in which they come.
-    events: [Event; MOST_EVENTS],
+    /// The leaves that are met, in file order.
+    leaves: [u8; MOST_LEAVES],
+    /// Where the ray enters and where it leaves each of them, two leaves a row: infinite where that
+    /// does not count, and once it is behind. They are not sorted: most walks end after a few steps.
+    ends: [[f64; 4]; MOST_LEAVES / 2],
     /// The nodes that the ray is inside.
     inside: u64,
     changes: Vec<Change>,
@@ -56,99 +59,125 @@ pub(super) struct Walk {
 
 impl Default for Walk {
     fn default() -> Self {
-        let events = [Event { t: 0.0, leaf: 0, enters: false }; MOST_EVENTS];
-        Self { events, inside: 0, changes: Vec::new() }
+        let ends = [[f64::INFINITY; 4]; MOST_LEAVES / 2];
+        Self { leaves: [0; MOST_LEAVES], ends, inside: 0, changes: Vec::new() }
     }
 }
 
 impl Walk {
-    /// Calls `take` for the crossings after `told` and up to `known`, in order, until it says that it
-    /// has enough; `told` follows. `touched` are the leaves that may count there, in file order, of a
-    /// solid of at most [`SolidNodeRecord::BITS`] nodes.
+    /// Calls `take` for the crossings after `told` and up to `reach`, in order, until it says that it
+    /// has enough; `told` follows. `touched` are the leaves that may count, a bit each, of a solid of
+    /// at most [`SolidNodeRecord::BITS`] nodes; it is not sure of more than [`MOST_LEAVES`].
     #[inline(always)]
     pub(super) fn tell(
         &mut self,
+        kernel: impl BoxKernel,
         course: &Course<'_>,
-        touched: &[u32],
-        (told, known): (&mut f64, f64),
+        touched: u64,
+        (told, reach): (&mut f64, f64),
         mut take: impl FnMut(Crossing) -> bool,
     ) -> Walked {
-        let Some(count) = self.collect(course, touched, [*told, known]) else {
+        let Some(count) = self.collect(kernel, course, touched, [*told, reach]) else {
             return Walked::Unsure;
         };
+        let rows = count.div_ceil(2);
         let apart = course.apart();
-        let mut next = 0;
-        while next < count && self.events[next].t <= known {
-            let event = self.events[next];
-            let mut end = next + 1;
-            while end < count && self.events[end].t == event.t {
-                end += 1;
-            }
-            if end < count && self.events[end].t - event.t <= apart {
+        let (_, mut t) = self.take_out(kernel, rows, f64::NAN);
+        while t <= reach && t < f64::INFINITY {
+            let (ends, next) = self.take_out(kernel, rows, t);
+            if next - t <= apart {
                 return Walked::Unsure;
             }
-            let crossed = match end - next {
-                1 => self.turn_for(course, Change::new(course, event)),
-                2 => self.turn_for_both(course, event, self.events[next + 1]),
-                _ => self.turn_for_all(course, next..end),
+            let first = self.event(ends.trailing_zeros());
+            let others = ends & (ends - 1);
+            let crossed = if others == 0 {
+                self.turn_for(course, Change::new(course, first))
+            } else if others.is_power_of_two() {
+                let second = self.event(others.trailing_zeros());
+                self.turn_for_both(course, first, second)
+            } else {
+                self.turn_for_all(course, ends)
             };
             if let Some(event) = crossed
-                && event.t > *told
+                && t > *told
             {
-                let crossing = course.sure_crossing(event.leaf, event.t, event.enters);
+                let crossing = course.sure_crossing(kernel, event.leaf, (t, event.enters));
                 if crossing.t >= 0.0 && take(crossing) {
                     return Walked::Enough;
                 }
             }
-            *told = told.max(event.t);
-            next = end;
+            *told = told.max(t);
+            t = next;
         }
         Walked::Through
     }
 
-    /// Meets the leaves, finds what the ray is inside at the beginning, and sorts the events; how many
-    /// there are. `None` if a leaf's stretch is not sure.
+    /// Takes the ends at `t` out: a bit for each of them, and the first of the others.
+    #[inline(always)]
+    fn take_out(&mut self, kernel: impl BoxKernel, rows: usize, t: f64) -> (u64, f64) {
+        let mut least = [f64::INFINITY; 4];
+        let mut taken = 0;
+        for (row, ends) in self.ends[..rows].iter_mut().enumerate() {
+            let ends = kernel.take_out(ends, t, &mut least);
+            taken |= u64::from(ends) << (4 * row);
+        }
+        let less = |a: f64, b: f64| if a < b { a } else { b };
+        let [a, b, c, d] = least;
+        (taken, less(less(a, b), less(c, d)))
+    }
+
+    /// An end, by its bit.
+    #[inline(always)]
+    fn event(&self, end: u32) -> Event {
+        let leaf = self.leaves[end as usize / 2].into();
+        Event { leaf, enters: end.is_multiple_of(2) }
+    }
+
+    /// Meets the leaves and finds what the ray is inside at the beginning; how many there are.
+    /// `None` if a leaf's stretch is not sure.
     #[inline(always)]
     fn collect(
         &mut self,
+        kernel: impl BoxKernel,
         course: &Course<'_>,
-        touched: &[u32],
-        [told, known]: [f64; 2],
+        mut touched: u64,
+        [told, reach]: [f64; 2],
     ) -> Option<usize> {
-        let (from, to) = (told - course.solid.margin, known + course.solid.margin);
+        if touched.count_ones() as usize > MOST_LEAVES {
+            return None;
+        }
+        let (from, to) = (told - course.solid.margin, reach + course.solid.margin);
         self.inside = 0;
-        let (mut count, mut rest) = (0, 0);
-        for &number in touched {
-            if number < rest {
-                continue;
-            }
+        let mut count = 0;
+        while touched != 0 {
+            let number = touched.trailing_zeros();
+            touched &= touched - 1;
             let leaf = &course.leaves[number as usize];
-            let [enter, leave] = course.sure_stretch(leaf)?;
+            let [enter, leave] = course.sure_stretch(kernel, leaf)?;
             if enter > to || leave < from {
-                rest = course.nodes[leaf.node as usize].rest;
+                // The leaves before the rest make no difference any more.
+                let rest = course.nodes[leaf.node as usize].rest;
+                touched &= u64::MAX.checked_shl(rest).unwrap_or(0);
                 continue;
             }
+            let mut ends = [f64::INFINITY; 2];
             if enter < from {
                 self.turn(course.nodes, leaf.node);
             } else {
-                self.insert(&mut count, Event { t: enter, leaf: number, enters: true });
+                ends[0] = enter;
             }
             if leave <= to {
-                self.insert(&mut count, Event { t: leave, leaf: number, enters: false });
+                ends[1] = leave;
             }
+            self.leaves[count] = number as u8;
+            let (row, side) = (&mut self.ends[count / 2], count % 2 * 2);
+            row[side..side + 2].copy_from_slice(&ends);
+            count += 1;
+        }
+        if count % 2 == 1 {
+            self.ends[count / 2][2..].fill(f64::INFINITY);
         }
         Some(count)
-    }
-
-    #[inline(always)]
-    fn insert(&mut self, count: &mut usize, event: Event) {
-        let mut at = *count;
-        while at > 0 && self.events[at - 1].t > event.t {
-            self.events[at] = self.events[at - 1];
-            at -= 1;
-        }
-        self.events[at] = event;
-        *count += 1;
     }
 
     /// Enters or leaves a node, and those above that change with it: the last of them.
@@ -205,10 +234,13 @@ impl Walk {
 
     /// The same for any number of events in one place.
     #[inline(never)]
-    fn turn_for_all(&mut self, course: &Course<'_>, events: Range<usize>) -> Option<Event> {
+    fn turn_for_all(&mut self, course: &Course<'_>, mut ends: u64) -> Option<Event> {
         let mut changes = std::mem::take(&mut self.changes);
         changes.clear();
-        changes.extend(self.events[events].iter().map(|&event| Change::new(course, event)));
+        while ends != 0 {
+            changes.push(Change::new(course, self.event(ends.trailing_zeros())));
+            ends &= ends - 1;
+        }
         changes.sort_unstable_by_key(|change| change.node);
         let event = self.turn_changes(course, &mut changes);
         self.changes = changes;

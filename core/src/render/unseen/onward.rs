@@ -24,7 +24,7 @@ use crate::{
     shade::{optics::mirror, point::Interaction},
     tile::Area,
     trace::{
-        batch::trace,
+        batch::{Room, trace},
         ray::{Hit, Ray},
     },
 };
@@ -279,7 +279,7 @@ impl<'a> OnwardSearch<'a> {
         }
         let mut hits = Vec::new();
         let never_stop = &mut || ControlFlow::Continue(());
-        let _ = trace(self.view, self.isa, &rays, &mut hits, never_stop);
+        let _ = trace(self.view, self.isa, &mut Room::default(), &rays, &mut hits, never_stop);
         self.ray_count += rays.len() as u64;
         for (look, hit) in next.iter_mut().zip(hits) {
             look.first.hit = Hit { t: look.first.hit.t + hit.t, ..hit };
