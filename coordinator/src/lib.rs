@@ -26,6 +26,7 @@ mod live;
 #[cfg(test)]
 mod load;
 mod members;
+mod memory;
 mod metrics;
 mod pace;
 mod page;
