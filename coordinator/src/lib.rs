@@ -26,7 +26,6 @@ mod live;
 #[cfg(test)]
 mod load;
 mod members;
-mod memory;
 mod metrics;
 mod pace;
 mod page;

@@ -31,7 +31,6 @@ use crate::{
     job::Job,
     lease::Run,
     members::{KeptOut, Mark, MemberEntry, NoMember, Process, Standing},
-    memory::give_back,
     record::{Plan, Ticket},
     state::{Durability, KeptJob, StateFolder},
     store::SceneFile,
@@ -607,7 +606,6 @@ impl Shell {
         let scene = SceneFile::write(scene_folder, &prepared)
             .map_err(|error| SubmitError::Scene(scene_folder.clone(), error))?;
         drop(prepared);
-        give_back();
         let (hash, scene_byte_count) = (scene.hash(), scene.byte_count());
         let plan = Plan { scene: hash, scene_byte_count, settings, grid, format, transfer };
         let job = Job::new(id, ticket, &plan, scene, canvas, (None, false));
