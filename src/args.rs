@@ -352,6 +352,12 @@ pub(crate) struct PictureArgs {
     /// Bits a channel of a PNG.
     #[arg(long, value_name = "BITS", value_parser = ["8", "16"], help_heading = PICTURE)]
     depth: Option<String>,
+
+    /// Say beside the picture, in FILE.json, when, how long and on which hosts it was rendered.
+    ///
+    /// What FILE itself says, scene and settings, is there too.
+    #[arg(long, help_heading = PICTURE)]
+    pub(crate) sidecar: bool,
 }
 
 #[derive(Debug, ClapArgs)]
@@ -561,7 +567,7 @@ pub(crate) struct SubmitArgs {
 
     /// Print the job's number and end: the job goes on by itself, and `rtfarm image` fetches what -o
     /// says. Otherwise an interruption cancels it.
-    #[arg(long, help_heading = FARM)]
+    #[arg(long, conflicts_with = "sidecar", help_heading = FARM)]
     pub(crate) detach: bool,
 
     /// What the job is called; the scene's file by default.
@@ -707,6 +713,7 @@ pub(crate) struct StationArgs {
 }
 
 #[derive(Debug, ClapArgs)]
+#[expect(clippy::struct_excessive_bools, reason = "each is a flag of its own")]
 pub(crate) struct ImageArgs {
     /// The job's number.
     #[arg(value_name = "JOB")]
@@ -719,6 +726,12 @@ pub(crate) struct ImageArgs {
     /// Have the farm keep the picture.
     #[arg(long)]
     pub(crate) keep: bool,
+
+    /// Say beside the picture, in FILE.json, how long and on which hosts it was rendered.
+    ///
+    /// What FILE itself says, scene and settings, is there too.
+    #[arg(long, conflicts_with = "partial")]
+    pub(crate) sidecar: bool,
 
     /// Answer in JSON.
     #[arg(long, help_heading = TALK)]

@@ -21,6 +21,7 @@ mod report;
 mod resume;
 mod scene_files;
 mod show;
+mod sidecar;
 mod slurm;
 mod source;
 mod submit;

@@ -1,7 +1,7 @@
 //! `rtfarm render`: a picture by this machine alone, or by a cluster's nodes.
 
 use std::{
-    collections::VecDeque,
+    collections::{BTreeSet, VecDeque},
     io::{self, Seek, Write},
     sync::{Arc, Mutex},
     time::Duration,
@@ -19,6 +19,7 @@ use rtfarm_core::{
 use rtfarm_job::{Order, Outcome, Progress, Provenance, Refusal};
 use rtfarm_picture::{Canvas, Notes};
 use rtfarm_proto::Address;
+use rustix::system::uname;
 use tokio::{
     net::UnixListener,
     sync::watch,
@@ -41,7 +42,9 @@ use crate::{
     private_folder::PrivateFolder,
     resume::{Begun, Resume},
     scene_files::SceneFiles,
-    show, slurm,
+    show,
+    sidecar::Making,
+    slurm,
     source::SceneText,
 };
 
@@ -58,9 +61,17 @@ pub(crate) struct Summary {
     /// From the first lease to the last tile.
     pub(crate) rendering: Duration,
     pub(crate) workers: usize,
+    /// Where they ran.
+    pub(crate) hosts: Arc<BTreeSet<String>>,
 }
 
 impl Summary {
+    /// What the file beside the picture is to say.
+    pub(crate) fn making(&self) -> Making {
+        let Self { tally, rendering, workers, .. } = *self;
+        Making { rendering, workers, hosts: self.hosts.as_ref().clone(), tally }
+    }
+
     /// What there is to say of light that lies too deep.
     fn depth_text(&self) -> String {
         let Tally { samples, untraced, most_untraced, .. } = self.tally;
@@ -294,7 +305,7 @@ impl Render<'_> {
     async fn render(&self, started: Started) -> Result<Rendered, Failure> {
         let Started { size, sampling, transfer, output, resume, work } = started;
         let mut workers = self.args.workers_and_threads().0;
-        let (picture, tally, rendering) = match work {
+        let (picture, tally, rendering, hosts) = match work {
             Work::Here(ordered) => {
                 let (order, begun) = *ordered;
                 let provenance = Provenance {
@@ -306,18 +317,20 @@ impl Render<'_> {
                     format: order.format,
                 };
                 let (canvas, tally, rendering) = self.render_here(order, begun).await?;
-                (Drawn::Here(Box::new((canvas, provenance))), tally, rendering)
+                let host = uname().nodename().to_string_lossy().into_owned();
+                let hosts = Arc::new(BTreeSet::from([host]));
+                (Drawn::Here(Box::new((canvas, provenance))), tally, rendering, hosts)
             }
             Work::Job(job) => {
                 let rendering = wait(&job, self.console).await?;
-                let Progress { tally, worker_count, .. } = *job.progress().borrow();
+                let Progress { tally, worker_count, hosts, .. } = job.progress().borrow().clone();
                 if self.args.slurm.is_some() {
                     workers = worker_count as usize;
                 }
-                (Drawn::Job(job), tally, rendering)
+                (Drawn::Job(job), tally, rendering, hosts)
             }
         };
-        let summary = Summary { size, tally, sampling, transfer, rendering, workers };
+        let summary = Summary { size, tally, sampling, transfer, rendering, workers, hosts };
         Ok(Rendered { summary, output, resume, picture })
     }
 
@@ -328,7 +341,8 @@ impl Render<'_> {
             Drawn::Here(..) => None,
             Drawn::Job(job) => Some(job.id()),
         };
-        write_picture(&output, self.stop, picture).await?;
+        let making = self.args.picture.sidecar.then(|| summary.making());
+        write_picture(&output, self.stop, picture, making).await?;
         if let (Some(coordinator), Some(job)) = (&self.coordinator, job) {
             if self.args.show {
                 // Who watches sees the end.
@@ -627,14 +641,18 @@ async fn wait(job: &Job, console: &Console) -> Result<Duration, Failure> {
     }
 }
 
-/// Encodes a picture into its file.
+/// Encodes a picture into its file, and writes the one beside it.
 async fn write_picture(
     output: &Output,
     stop: &CancellationToken,
     drawn: Drawn,
+    making: Option<Making>,
 ) -> Result<(), Failure> {
     let (output, token) = (output.clone(), stop.clone());
-    let written = spawn_blocking(move || output.write(&token, |file| drawn.encode(file)));
+    let written = spawn_blocking(move || {
+        output.write(&token, |file| drawn.encode(file))?;
+        making.map_or(Ok(()), |making| making.write(&output, &token))
+    });
     match written.await? {
         Err(_) if stop.is_cancelled() => Err(Failure::Interrupted),
         written => Ok(written?),

@@ -156,9 +156,10 @@ fn people_can_live_with_the_queue() {
     assert_eq!(json(&place, &url, &["watch", &third])["state"], "finished");
     let here = place.render("here.png", &[&small[..], &["--workers", "0"]].concat());
     json(&place, &url, &["image", &third, "-o", "kept.png", "--keep"]);
-    json(&place, &url, &["image", &third, "-o", "out.png"]);
+    json(&place, &url, &["image", &third, "-o", "out.png", "--sidecar"]);
     assert!(fs::read(place.path("out.png")).unwrap() == here);
     assert!(fs::read(place.path("kept.png")).unwrap() == here);
+    verify::check_sidecar(&place, "out.png", 1);
     assert!(order(&place, &url).is_empty(), "it was fetched");
     worker.signal(Signal::TERM);
     worker.wait();
