@@ -475,13 +475,18 @@ pub(crate) struct CoordinatorArgs {
     #[arg(long, value_name = "N", default_value = "64", value_parser = value_parser!(u16).range(1..), env = "RTFARM_STRANGERS", help_heading = LIMITS)]
     strangers: u16,
 
-    /// A client that sends nothing of its scene for this long is given up.
+    /// Who sends nothing of a scene or takes nothing of one or of a picture for this long is given up.
     #[arg(long, value_name = "S", default_value = "30", value_parser = parse_seconds, env = "RTFARM_UPLOAD_SECONDS", help_heading = LIMITS)]
     pub(crate) upload_seconds: Duration,
 
     /// The most bytes, in GB, that scenes have together which are being sent.
     #[arg(long, value_name = "GB", default_value = "8", value_parser = parse_gigabytes, env = "RTFARM_UPLOAD_GB", help_heading = LIMITS)]
     upload_gb: u64,
+
+    /// The most bytes, in MB, of pixels, scenes and pictures that are in memory on their way here, and as
+    /// many on their way elsewhere; what more there is waits.
+    #[arg(long, value_name = "MB", default_value = "1000", value_parser = value_parser!(u32).range(16..), env = "RTFARM_FLIGHT_MB", help_heading = LIMITS)]
+    flight_mb: u32,
 
     /// The most jobs that have not ended; who has the token `admin` may order more, also of the next two.
     #[arg(long, value_name = "N", default_value = "1000", env = "RTFARM_MOST_JOBS", help_heading = LIMITS)]
@@ -840,7 +845,8 @@ impl CoordinatorArgs {
     /// How much may be ordered.
     pub(crate) fn orders(&self) -> OrderLimits {
         let (jobs, pixels) = (self.most_jobs, self.most_megapixels);
-        OrderLimits { jobs, pixels, bytes: self.most_gb, upload_bytes: self.upload_gb }
+        let (upload_bytes, flight_bytes) = (self.upload_gb, u64::from(self.flight_mb) * 1_000_000);
+        OrderLimits { jobs, pixels, bytes: self.most_gb, upload_bytes, flight_bytes }
     }
 
     /// How connections of strangers are limited.
