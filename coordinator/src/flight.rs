@@ -52,6 +52,6 @@ mod tests {
         let large = large.await.unwrap();
         assert_eq!(large.num_permits(), 3, "all there is");
         drop(large);
-        flight.take(3 * CHUNK_BYTES).await;
+        let _all = flight.take(3 * CHUNK_BYTES).await;
     }
 }

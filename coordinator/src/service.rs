@@ -79,9 +79,9 @@ pub(crate) fn router(
     let (reporter, health) = tonic_health::server::health_reporter();
     drop(reporter);
     let keeper = security.clone().map_or(Keeper::Nobody, Keeper::Farm);
-    let guarded = (security.clone(), shell.arriving.clone());
-    let routes = Routes::new(Guarded::new(farm, guarded.0.clone(), guarded.1.clone()))
-        .add_service(Guarded::new(jobs, guarded.0, guarded.1))
+    let arriving = shell.arriving.clone();
+    let routes = Routes::new(Guarded::new(farm, security.clone(), arriving.clone()))
+        .add_service(Guarded::new(jobs, security, arriving))
         .add_service(health)
         .into_axum_router()
         .fallback_service(Page::new(shell, keeper));
