@@ -255,7 +255,7 @@ mod tests {
         timeout(4 * patience, read(&mut stream)).await.expect_err("it is waited for");
     }
 
-    #[tokio::test]
+    #[tokio::test(start_paused = true)]
     async fn connections_that_cannot_be_accepted_are_tried_again_after_a_pause() {
         let mut attempts = 0;
         let accept = |_: &mut Context<'_>| {

@@ -15,7 +15,7 @@ use super::*;
 /// A farm with certificates and tokens, started; and its address.
 fn start_farm(place: &Place) -> (Process, String) {
     let args = ["coordinator", "--listen", "127.0.0.1:0", "--state", "farm"];
-    let limits = ["--strangers", "4", "--greeting-seconds", "1", "--handshake-seconds", "1"];
+    let limits = ["--strangers", "4", "--greeting-seconds", "3", "--handshake-seconds", "3"];
     let mut coordinator = place.start("coordinator.log", &[&args[..], &limits].concat());
     let line = coordinator.read_line();
     let url = line.trim().strip_prefix("listening on ").expect(&line).to_owned();
@@ -159,11 +159,7 @@ fn who_has_no_token_or_that_of_another_role_or_farm_is_refused_and_told_why() {
         (vec!["jobs"], 2, "--access FILE"),
         (vec!["jobs", "--coordinator", &url], 1, "needs an access file"),
         ([&order[..], &[&of("read")]].concat(), 1, "the token is one to read"),
-        (
-            vec!["worker", "--access", &of("submit"), "--patience", "1"],
-            1,
-            "the token is one to submit",
-        ),
+        (vec!["worker", "--access", &of("submit")], 1, "the token is one to submit"),
         // Another farm's coordinator, and one that shows no certificate.
         (
             vec!["jobs", "--access", "foreign", "--coordinator", &url],
