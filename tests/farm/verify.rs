@@ -28,6 +28,24 @@ fn a_picture_is_verified_with_another_instruction_set_and_what_was_changed_is_fo
         assert!(code == Some(0) && said.contains("\"checked\": 2"), "{output}: {said}");
     }
 
+    // Settings that are given are those of the picture, or what differs is said.
+    for (words, difference) in [
+        (&["--size", "96x64", "--samples", "3", "--transfer", "srgb", "--tile", "16"][..], ""),
+        (&["--seed", "0", "--secondary", "on", "--depth", "8"], ""),
+        (&["--size", "96x65"], "--size makes frame 96x65, the picture says frame 96x64"),
+        (&["--samples", "4"], "--samples makes samples 4, the picture says samples 3"),
+        (&["--error", "0.5"], "--error makes error 0.5, the picture does not say it"),
+        (&["--depth", "16"], "--depth makes format png16, the picture says format png8"),
+        (&["--secondary", "off"], "--secondary makes secondary false, the picture says"),
+        (&["--crop", "0,0,9,9"], "--crop makes window 0,0,9,9, the picture says window 0,0,96,64"),
+        (&["--flat"], "--flat makes flat true, the picture says flat false"),
+    ] {
+        let (code, said) = verify(&place, &[&["a.png", "scene.rt"], words].concat());
+        let expected = if difference.is_empty() { "are the same to the bit" } else { difference };
+        assert!(said.contains(expected), "{words:?}: {said}");
+        assert_eq!(code, Some(i32::from(!difference.is_empty())), "{words:?}: {said}");
+    }
+
     // One step of one pixel.
     let whole = fs::read(place.path("a.png")).unwrap();
     let mut reader = png::Decoder::new(std::io::Cursor::new(&whole)).read_info().unwrap();
