@@ -390,7 +390,8 @@ pub(crate) struct RenderArgs {
 
     /// Go on with what an earlier render with --resume left when it was interrupted.
     ///
-    /// The folder FILE.rtfarm has it until the picture is there.
+    /// The folder FILE.rtfarm has it until the picture is there. Of --frames, those whose picture is there,
+    /// rendered from the same scene with the same settings by this build, are passed over.
     #[arg(long, conflicts_with = "time", help_heading = WORK)]
     pub(crate) resume: bool,
 

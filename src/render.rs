@@ -17,7 +17,7 @@ use rtfarm_core::{
     transfer::Transfer,
 };
 use rtfarm_job::{Order, Outcome, Progress, Provenance, Refusal};
-use rtfarm_picture::{Canvas, Notes};
+use rtfarm_picture::{Canvas, Notes, PictureReader};
 use rtfarm_proto::Address;
 use rustix::system::uname;
 use tokio::{
@@ -182,6 +182,27 @@ impl Drawn {
     }
 }
 
+/// What this program's picture of an order depends on.
+fn provenance(order: &Order) -> Provenance {
+    Provenance {
+        build: software(),
+        scene: order.prepared.hash(),
+        settings: order.settings,
+        grid: order.grid,
+        transfer: order.transfer,
+        format: order.format,
+    }
+}
+
+/// Says whether a picture is in its place, with what stands beside it, and nothing of it is left to do.
+fn is_there(output: &Output, wanted: &Provenance, has_sidecar: bool) -> bool {
+    let is_whole = !Resume::folder(output).exists();
+    let has_all = !has_sidecar || Making::path(output).exists();
+    let reader = PictureReader::open(output.path());
+    let found = reader.ok().and_then(|reader| Provenance::read(&reader.notes().provenance).ok());
+    is_whole && has_all && found.as_ref() == Some(wanted)
+}
+
 /// This program's version and build.
 pub(crate) fn software() -> String {
     format!("{VERSION} ({BUILD})")
@@ -223,7 +244,7 @@ pub(crate) async fn run(
         wanted.push_back((picture, output));
     }
     let mut render = Render { args: &args, console, stop, coordinator: None, told: started.into() };
-    let first = render.place_next(&mut wanted).await?.expect("there is one at least");
+    let Some(first) = render.place_next(&mut wanted).await? else { return Ok(()) };
     match args.workers_and_threads() {
         (0, _) if args.slurm.is_none() => {
             let (last, end) = render.all_but_the_last(first, wanted).await?;
@@ -235,18 +256,26 @@ pub(crate) async fn run(
 }
 
 impl Render<'_> {
-    /// Reads the next scene and begins its picture, if there is one.
+    /// Reads the next scene and begins its picture, if there is one. Frames that an earlier render with
+    /// --resume has finished are passed over.
     async fn place_next(&self, wanted: &mut Wanted) -> Result<Option<Frame>, Failure> {
-        let Some((picture, output)) = wanted.pop_front() else { return Ok(None) };
         let (console, stop) = (self.console, self.stop);
-        let text = SceneText::read(&picture.scene, stop).await?;
-        let has_cache = !self.args.no_cache;
-        let mut order = place(&picture, &output, text, has_cache, console, stop).await?;
-        if let Some(time) = self.args.time {
-            order = choose_quality(order, time, self.args, stop).await?;
+        while let Some((picture, output)) = wanted.pop_front() {
+            let text = SceneText::read(&picture.scene, stop).await?;
+            let has_cache = !self.args.no_cache;
+            let mut order = place(&picture, &output, text, has_cache, console, stop).await?;
+            if let Some(time) = self.args.time {
+                order = choose_quality(order, time, self.args, stop).await?;
+            }
+            let may_be_there = self.args.resume && self.args.frames.is_some();
+            if may_be_there && is_there(&output, &provenance(&order), picture.sidecar) {
+                tracing::info!("{} is there already", output.name().display());
+                continue;
+            }
+            let (order, begun, resume) = begin(order, &output, self.args.resume).await?;
+            return Ok(Some(Frame { order, begun, output, resume }));
         }
-        let (order, begun, resume) = begin(order, &output, self.args.resume).await?;
-        Ok(Some(Frame { order, begun, output, resume }))
+        Ok(None)
     }
 
     /// Renders pictures one after the other: while one is rendered the last is written, and the next is
@@ -308,14 +337,7 @@ impl Render<'_> {
         let (picture, tally, rendering, hosts) = match work {
             Work::Here(ordered) => {
                 let (order, begun) = *ordered;
-                let provenance = Provenance {
-                    build: software(),
-                    scene: order.prepared.hash(),
-                    settings: order.settings,
-                    grid: order.grid,
-                    transfer: order.transfer,
-                    format: order.format,
-                };
+                let provenance = provenance(&order);
                 let (canvas, tally, rendering) = self.render_here(order, begun).await?;
                 let host = uname().nodename().to_string_lossy().into_owned();
                 let hosts = Arc::new(BTreeSet::from([host]));

@@ -4,6 +4,7 @@
 use std::{
     collections::BTreeSet,
     io::Write,
+    path::PathBuf,
     time::{Duration, SystemTime, UNIX_EPOCH},
 };
 
@@ -30,6 +31,11 @@ pub(crate) struct Making {
 }
 
 impl Making {
+    /// Where the file is.
+    pub(crate) fn path(output: &Output) -> PathBuf {
+        output.beside(EXTENSION)
+    }
+
     /// Writes the file beside a picture that is in its place. Never call this on the async runtime.
     pub(crate) fn write(&self, output: &Output, stop: &CancellationToken) -> anyhow::Result<()> {
         let name = output.name().display();
