@@ -659,7 +659,7 @@ impl AccessArgs {
             read().with_context(|| format!("cannot use the access file {}", path.display()))?;
         Ok(match address {
             Some(address) => access.at(address),
-            None => access,
+            None => access.kept_in(path.clone()),
         })
     }
 }

@@ -195,6 +195,34 @@ fn who_has_no_token_or_that_of_another_role_or_farm_is_refused_and_told_why() {
 }
 
 #[test]
+fn a_coordinator_that_comes_back_elsewhere_is_found_again_by_those_who_have_its_access_files() {
+    let place = Place::new();
+    let start = |log: &str| {
+        let listen = own_address();
+        let args = ["coordinator", "--listen", &listen, "--state", "farm"];
+        let mut coordinator = place.start(log, &args);
+        assert!(coordinator.read_line().ends_with(&format!("{listen}\n")));
+        coordinator
+    };
+    let mut first = start("first.log");
+    let worker = ["worker", "--threads", "1", "--access", "farm/access/work"];
+    let mut worker = place.start("worker.log", &worker);
+    let submit = ["submit", "scene.rt", "-o", "out.png", "--access", "farm/access/submit"];
+    let mut submit = place.start("submit.log", &[&submit[..], &SLOW].concat());
+    poll(|| (first.tiles_done() >= 10).then_some(()));
+    first.signal(Signal::KILL);
+    first.wait();
+    let mut second = start("second.log");
+    assert!(submit.wait().success(), "{}", submit.log());
+    assert!(second.tiles_done() > 0);
+    second.signal(Signal::TERM);
+    assert_eq!(second.wait().code(), Some(0), "{}", second.log());
+    assert!(worker.wait().success(), "sent home: {}", worker.log());
+    let here = place.render("here.png", &[&SLOW[..], &["--workers", "0"]].concat());
+    assert!(fs::read(place.path("out.png")).unwrap() == here);
+}
+
+#[test]
 fn certificates_made_before_are_those_of_the_coordinator() {
     let place = Place::new();
     let certs = ["certs", "--state", "farm", "--name", "renderhost", "--port", "7"];
