@@ -19,6 +19,7 @@ use tokio::{
     sync::{OwnedSemaphorePermit, Semaphore, mpsc},
     time::{Sleep, sleep},
 };
+use tokio_rustls::server::TlsStream;
 use tonic::transport::server::Connected;
 
 /// How connections of strangers are limited.
@@ -112,6 +113,14 @@ pub(crate) struct Greeted<S> {
 impl<S> Greeted<S> {
     fn new(stream: S, peer: Peer, patience: Duration) -> Self {
         Self { stream, peer, deadline: Some(Box::pin(sleep(patience))) }
+    }
+}
+
+impl<S> Greeted<TlsStream<Greeted<S>>> {
+    /// A connection whose hands are shaken; what lies below keeps the time.
+    pub(crate) fn around(stream: TlsStream<Greeted<S>>) -> Self {
+        let peer = stream.get_ref().0.peer.clone();
+        Self { stream, peer, deadline: None }
     }
 }
 

@@ -31,7 +31,7 @@ use tokio_util::sync::CancellationToken;
 use tonic::{
     Request, Response, Status, Streaming,
     service::Routes,
-    transport::{Server, ServerTlsConfig, server::Router},
+    transport::{Server, server::Router},
 };
 
 use crate::{
@@ -66,11 +66,7 @@ type Chunks = Pin<Box<dyn Stream<Item = Result<wire::Chunk, Status>> + Send>>;
 type Events = Pin<Box<dyn Stream<Item = Result<wire::Event, Status>> + Send>>;
 
 /// Both services over one coordinator and its page, for those who have a token if there is `security`.
-pub(crate) fn router(
-    shell: &Arc<Shell>,
-    security: Option<Arc<Security>>,
-    tls: Option<ServerTlsConfig>,
-) -> Result<Router, tonic::transport::Error> {
+pub(crate) fn router(shell: &Arc<Shell>, security: Option<Arc<Security>>) -> Router {
     const WINDOW_BYTES: u32 = 1 << 22;
     // A frame of a delivery; each costs both sides a call of the system.
     const FRAME_BYTES: u32 = 1 << 17;
@@ -85,19 +81,15 @@ pub(crate) fn router(
         .add_service(health)
         .into_axum_router()
         .fallback_service(Page::new(shell, keeper));
-    let server = match tls {
-        Some(tls) => Server::builder().tls_config(tls)?,
-        None => Server::builder(),
-    };
-    Ok(server
+    Server::builder()
         .initial_stream_window_size(WINDOW_BYTES)
         .initial_connection_window_size(WINDOW_BYTES)
         .max_frame_size(FRAME_BYTES)
         .http2_keepalive_interval(Some(Duration::from_secs(10)))
         .http2_keepalive_timeout(Some(Duration::from_secs(20)))
-        // Browsers speak it where nothing is encrypted.
+        // Browsers speak it where nothing is encrypted, and may elsewhere.
         .accept_http1(true)
-        .add_routes(routes.into()))
+        .add_routes(routes.into())
 }
 
 /// The page alone, for those who have this token.
