@@ -180,12 +180,16 @@ pub(crate) struct CertsArgs {
 
 #[derive(Debug, ClapArgs)]
 pub(crate) struct VerifyArgs {
-    /// The picture, which says itself with which settings it was rendered.
+    /// The picture, which says itself with which settings it was rendered; those that are given here must
+    /// be the same.
     #[arg(value_name = "IMAGE")]
     pub(crate) image: PathBuf,
 
     #[command(flatten)]
     pub(crate) scene: SceneArgs,
+
+    #[command(flatten)]
+    pub(crate) settings: SettingArgs,
 
     /// So many tiles, which are drawn by chance, or `all`; by default some, at least 8 and at most 1024.
     #[arg(long, value_name = "N|all", default_value = "few", hide_default_value = true, help_heading = WORK)]
@@ -292,16 +296,9 @@ pub(crate) struct ReportArgs {
     pub(crate) wanted: Option<StandardError>,
 }
 
-/// What picture is wanted.
+/// What a picture depends on besides its scene, as far as it is said.
 #[derive(Debug, Clone, ClapArgs)]
-pub(crate) struct PictureArgs {
-    #[command(flatten)]
-    pub(crate) scene: SceneArgs,
-
-    /// Where the picture goes; the extension, .png or .exr, says how it is written.
-    #[arg(short, long = "output", value_name = "FILE")]
-    pub(crate) output: PathBuf,
-
+pub(crate) struct SettingArgs {
     /// The picture's size in pixels; the size that the scene asks for by default.
     #[arg(long, value_name = "WxH", value_parser = parse_size, help_heading = PICTURE)]
     size: Option<Size>,
@@ -319,39 +316,59 @@ pub(crate) struct PictureArgs {
     /// Sample each pixel until its standard error is below this, where 1 is full light [default: 1/255].
     ///
     /// It is an error of light, not of encoded values, whatever the --transfer.
-    #[arg(long, value_name = "ERROR", default_value_t = StandardError::EIGHT_BIT_STEP, hide_default_value = true, value_parser = parse_error, help_heading = PICTURE)]
-    error: StandardError,
+    #[arg(long, value_name = "ERROR", value_parser = parse_error, help_heading = PICTURE)]
+    error: Option<StandardError>,
 
-    /// But at most so often.
-    #[arg(long, value_name = "N", default_value_t = SampleLimit::DEFAULT, value_parser = parse_max_samples, help_heading = PICTURE)]
-    max_samples: SampleLimit,
+    /// But at most so often [default: 256].
+    #[arg(long, value_name = "N", value_parser = parse_max_samples, help_heading = PICTURE)]
+    max_samples: Option<SampleLimit>,
 
-    /// Chooses the random numbers.
-    #[arg(long, value_name = "N", default_value_t = 0, help_heading = PICTURE)]
-    seed: u64,
+    /// Chooses the random numbers [default: 0].
+    #[arg(long, value_name = "N", help_heading = PICTURE)]
+    seed: Option<u64>,
 
     /// Show every surface in its plain colour, as in a scene without light.
     #[arg(long, help_heading = PICTURE)]
     flat: bool,
 
-    /// Whether surfaces that mirror light others.
-    #[arg(long, value_name = "on|off", default_value = "on", hide_possible_values = true, help_heading = PICTURE)]
-    secondary: Switch,
+    /// Whether surfaces that mirror light others [default: on].
+    #[arg(long, value_name = "on|off", hide_possible_values = true, help_heading = PICTURE)]
+    secondary: Option<Switch>,
 
     /// The side of a tile in pixels; by default the one that gives about 1000 tiles.
     #[arg(long, value_name = "N", value_parser = value_parser!(u64).range(TileGrid::SIDES), help_heading = PICTURE)]
     tile: Option<u64>,
 
-    /// What the numbers of colours say: the light itself, or light encoded by the sRGB curve.
+    /// What the numbers of colours say: the light itself, or light encoded by the sRGB curve [default: none].
     ///
     /// Then colours of materials, textures, point lights and the background are decoded, and a PNG is
     /// encoded; an EXR holds light.
-    #[arg(long, value_name = "none|srgb", default_value = "none", value_parser = parse_transfer, help_heading = PICTURE)]
-    transfer: Transfer,
+    #[arg(long, value_name = "none|srgb", value_parser = parse_transfer, help_heading = PICTURE)]
+    transfer: Option<Transfer>,
 
     /// Bits a channel of a PNG.
     #[arg(long, value_name = "BITS", value_parser = ["8", "16"], help_heading = PICTURE)]
     depth: Option<String>,
+}
+
+/// What picture is wanted.
+#[derive(Debug, Clone, ClapArgs)]
+pub(crate) struct PictureArgs {
+    #[command(flatten)]
+    pub(crate) scene: SceneArgs,
+
+    /// Where the picture goes; the extension, .png or .exr, says how it is written.
+    #[arg(short, long = "output", value_name = "FILE")]
+    pub(crate) output: PathBuf,
+
+    #[command(flatten)]
+    settings: SettingArgs,
+
+    /// Say beside the picture, in FILE.json, when, how long and on which hosts it was rendered.
+    ///
+    /// What FILE itself says, scene and settings, is there too.
+    #[arg(long, help_heading = PICTURE)]
+    pub(crate) sidecar: bool,
 }
 
 #[derive(Debug, ClapArgs)]
@@ -373,7 +390,8 @@ pub(crate) struct RenderArgs {
 
     /// Go on with what an earlier render with --resume left when it was interrupted.
     ///
-    /// The folder FILE.rtfarm has it until the picture is there.
+    /// The folder FILE.rtfarm has it until the picture is there. Of --frames, those whose picture is there,
+    /// rendered from the same scene with the same settings by this build, are passed over.
     #[arg(long, conflicts_with = "time", help_heading = WORK)]
     pub(crate) resume: bool,
 
@@ -469,13 +487,18 @@ pub(crate) struct CoordinatorArgs {
     #[arg(long, value_name = "N", default_value = "64", value_parser = value_parser!(u16).range(1..), env = "RTFARM_STRANGERS", help_heading = LIMITS)]
     strangers: u16,
 
-    /// A client that sends nothing of its scene for this long is given up.
+    /// Who sends nothing of a scene or takes nothing of one or of a picture for this long is given up.
     #[arg(long, value_name = "S", default_value = "30", value_parser = parse_seconds, env = "RTFARM_UPLOAD_SECONDS", help_heading = LIMITS)]
     pub(crate) upload_seconds: Duration,
 
     /// The most bytes, in GB, that scenes have together which are being sent.
     #[arg(long, value_name = "GB", default_value = "8", value_parser = parse_gigabytes, env = "RTFARM_UPLOAD_GB", help_heading = LIMITS)]
     upload_gb: u64,
+
+    /// The most bytes, in MB, of pixels, scenes and pictures that are in memory on their way here, and as
+    /// many on their way elsewhere; what more there is waits.
+    #[arg(long, value_name = "MB", default_value = "1000", value_parser = value_parser!(u32).range(16..), env = "RTFARM_FLIGHT_MB", help_heading = LIMITS)]
+    flight_mb: u32,
 
     /// The most jobs that have not ended; who has the token `admin` may order more, also of the next two.
     #[arg(long, value_name = "N", default_value = "1000", env = "RTFARM_MOST_JOBS", help_heading = LIMITS)]
@@ -561,7 +584,7 @@ pub(crate) struct SubmitArgs {
 
     /// Print the job's number and end: the job goes on by itself, and `rtfarm image` fetches what -o
     /// says. Otherwise an interruption cancels it.
-    #[arg(long, help_heading = FARM)]
+    #[arg(long, conflicts_with = "sidecar", help_heading = FARM)]
     pub(crate) detach: bool,
 
     /// What the job is called; the scene's file by default.
@@ -636,7 +659,7 @@ impl AccessArgs {
             read().with_context(|| format!("cannot use the access file {}", path.display()))?;
         Ok(match address {
             Some(address) => access.at(address),
-            None => access,
+            None => access.kept_in(path.clone()),
         })
     }
 }
@@ -707,6 +730,7 @@ pub(crate) struct StationArgs {
 }
 
 #[derive(Debug, ClapArgs)]
+#[expect(clippy::struct_excessive_bools, reason = "each is a flag of its own")]
 pub(crate) struct ImageArgs {
     /// The job's number.
     #[arg(value_name = "JOB")]
@@ -719,6 +743,12 @@ pub(crate) struct ImageArgs {
     /// Have the farm keep the picture.
     #[arg(long)]
     pub(crate) keep: bool,
+
+    /// Say beside the picture, in FILE.json, how long and on which hosts it was rendered.
+    ///
+    /// What FILE itself says, scene and settings, is there too.
+    #[arg(long, conflicts_with = "partial")]
+    pub(crate) sidecar: bool,
 
     /// Answer in JSON.
     #[arg(long, help_heading = TALK)]
@@ -781,30 +811,68 @@ impl ReportArgs {
 impl PictureArgs {
     /// Where the picture goes and how it is written.
     pub(crate) fn output(&self) -> anyhow::Result<Output> {
-        Output::new(&self.output, self.depth.as_deref())
+        Output::new(&self.output, self.settings.depth.as_deref())
     }
 
     /// What is wanted of the scene.
     pub(crate) fn request(&self, format: PictureFormat) -> RenderRequest {
+        let settings = &self.settings;
         RenderRequest {
             name: self.scene.name(),
             strict: self.scene.strict,
-            size: self.size,
+            size: settings.size,
             quality: Quality {
-                sampling: match self.samples {
+                sampling: match settings.samples {
                     Some(count) => Sampling::Fixed(count),
-                    None => Sampling::Adaptive { error: self.error, most: self.max_samples },
+                    None => Sampling::Adaptive {
+                        error: settings.error.unwrap_or(StandardError::EIGHT_BIT_STEP),
+                        most: settings.max_samples.unwrap_or(SampleLimit::DEFAULT),
+                    },
                 },
-                seed: self.seed,
-                flat: self.flat,
-                secondary: matches!(self.secondary, Switch::On),
+                seed: settings.seed.unwrap_or(0),
+                flat: settings.flat,
+                secondary: !matches!(settings.secondary, Some(Switch::Off)),
                 clips: format != PictureFormat::ExrF32,
             },
-            crop: self.crop,
-            tile_side: self.tile,
-            transfer: self.transfer,
+            crop: settings.crop,
+            tile_side: settings.tile,
+            transfer: settings.transfer.unwrap_or(Transfer::None),
             format,
         }
+    }
+}
+
+impl SettingArgs {
+    /// What is said of a picture, as the options that say it and as a picture's file has it: words and
+    /// their values.
+    pub(crate) fn said(&self) -> Vec<(&'static str, &'static str, String)> {
+        let Self { size, crop, samples, error, max_samples, .. } = self;
+        let Self { seed, flat, secondary, tile, transfer, depth, .. } = self;
+        let window = |crop: Crop| {
+            let Crop { corner: [x, y], sides: [width, height] } = crop;
+            format!("{x},{y},{width},{height}")
+        };
+        let secondary = secondary.map(|switch| (switch == Switch::On).to_string());
+        let transfer = transfer.map(|transfer| match transfer {
+            Transfer::None => "none",
+            Transfer::Srgb => "srgb",
+        });
+        [
+            ("size", "frame", size.map(|size| size.to_string())),
+            ("crop", "window", crop.map(window)),
+            ("samples", "samples", samples.map(|count| count.get().to_string())),
+            ("error", "error", error.map(|error| error.get().to_string())),
+            ("max-samples", "max-samples", max_samples.map(|most| most.get().to_string())),
+            ("seed", "seed", seed.map(|seed| seed.to_string())),
+            ("flat", "flat", flat.then(|| "true".to_owned())),
+            ("secondary", "secondary", secondary),
+            ("tile", "tile", tile.map(|side| side.to_string())),
+            ("transfer", "transfer", transfer.map(str::to_owned)),
+            ("depth", "format", depth.as_ref().map(|bits| format!("png{bits}"))),
+        ]
+        .into_iter()
+        .filter_map(|(option, word, value)| Some((option, word, value?)))
+        .collect()
     }
 }
 
@@ -827,7 +895,8 @@ impl CoordinatorArgs {
     /// How much may be ordered.
     pub(crate) fn orders(&self) -> OrderLimits {
         let (jobs, pixels) = (self.most_jobs, self.most_megapixels);
-        OrderLimits { jobs, pixels, bytes: self.most_gb, upload_bytes: self.upload_gb }
+        let (upload_bytes, flight_bytes) = (self.upload_gb, u64::from(self.flight_mb) * 1_000_000);
+        OrderLimits { jobs, pixels, bytes: self.most_gb, upload_bytes, flight_bytes }
     }
 
     /// How connections of strangers are limited.

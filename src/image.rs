@@ -2,7 +2,13 @@
 
 use std::time::Duration;
 
-use rtfarm_proto::{Access, wire};
+use anyhow::anyhow;
+use rtfarm_client::plain;
+use rtfarm_core::render::Tally;
+use rtfarm_proto::{
+    Access,
+    wire::{self, event},
+};
 use tokio::{sync::mpsc, task::spawn_blocking, time::timeout};
 use tokio_util::sync::CancellationToken;
 
@@ -11,11 +17,15 @@ use crate::{
     failure::Failure,
     output::Output,
     queue::{connect, late, picture_json, refused, tell},
+    sidecar::Making,
     submit::write_chunks,
 };
 
 /// A coordinator that listens forgets a job at once.
 const FORGET_DEADLINE: Duration = Duration::from_secs(3);
+
+/// The longest that an answer may take which is there already.
+const ANSWER_DEADLINE: Duration = Duration::from_secs(15);
 
 /// Encoding a large picture takes a while.
 const IMAGE_DEADLINE: Duration = Duration::from_secs(600);
@@ -40,6 +50,11 @@ pub(crate) async fn run(args: ImageArgs, stop: &CancellationToken) -> Result<(),
     let written = writing.await?;
     fetched?;
     written?;
+    if args.sidecar {
+        let making = ask_making(&args, &access).await?;
+        let (output, stop) = (output.clone(), stop.clone());
+        spawn_blocking(move || making.write(&output, &stop)).await??;
+    }
     if !args.partial && !args.keep {
         forget(&args, &access).await;
     }
@@ -60,6 +75,27 @@ async fn forget(args: &ImageArgs, access: &Access) {
     if let Err(error) = forgotten {
         tracing::warn!(reason = %error, "the farm still keeps the picture");
     }
+}
+
+/// Asks how a finished picture came about.
+async fn ask_making(args: &ImageArgs, access: &Access) -> anyhow::Result<Making> {
+    let ask = async {
+        let request = wire::WatchRequest { job: args.job, ..wire::WatchRequest::default() };
+        let events = connect(access).await?.watch(request).await.map_err(refused)?;
+        events.into_inner().message().await.map_err(refused)
+    };
+    let event = timeout(ANSWER_DEADLINE, ask).await.map_err(late)??;
+    let senseless = || anyhow!("the coordinator's answer makes no sense");
+    let wire::Event { tally, workers, hosts, end, .. } = event.ok_or_else(senseless)?;
+    let Some(event::End::Finished(wire::Finished { seconds })) = end else {
+        return Err(senseless());
+    };
+    Ok(Making {
+        rendering: Duration::try_from_secs_f64(seconds).map_err(|_| senseless())?,
+        workers: workers as usize,
+        hosts: hosts.iter().map(|host| plain(host)).collect(),
+        tally: Tally::try_from(tally.unwrap_or_default()).map_err(|_| senseless())?,
+    })
 }
 
 /// Brings the picture and hands it on, piece by piece; the last one is empty.

@@ -22,6 +22,7 @@ mod report;
 mod resume;
 mod scene_files;
 mod show;
+mod sidecar;
 mod slurm;
 mod source;
 mod submit;

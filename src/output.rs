@@ -43,6 +43,11 @@ impl Output {
         &self.name
     }
 
+    /// Where the file is.
+    pub(crate) fn path(&self) -> &Path {
+        &self.path
+    }
+
     pub(crate) fn format(&self) -> PictureFormat {
         self.format
     }
@@ -81,7 +86,28 @@ impl Output {
         stop: &CancellationToken,
         write: impl FnOnce(&mut OutputFile<'_>) -> io::Result<()>,
     ) -> anyhow::Result<()> {
-        let in_place = || format!("cannot write {}", self.name.display());
+        self.write_at(&self.path, &self.name, stop, write)
+    }
+
+    /// The same for something that stands beside the picture.
+    pub(crate) fn write_beside(
+        &self,
+        extension: &str,
+        stop: &CancellationToken,
+        write: impl FnOnce(&mut OutputFile<'_>) -> io::Result<()>,
+    ) -> anyhow::Result<()> {
+        let path = self.beside(extension);
+        self.write_at(&path, &path, stop, write)
+    }
+
+    fn write_at(
+        &self,
+        path: &Path,
+        name: &Path,
+        stop: &CancellationToken,
+        write: impl FnOnce(&mut OutputFile<'_>) -> io::Result<()>,
+    ) -> anyhow::Result<()> {
+        let in_place = || format!("cannot write {}", name.display());
         let mut file = tempfile::Builder::new()
             .prefix(".rtfarm-")
             .permissions(fs::Permissions::from_mode(0o666))
@@ -92,7 +118,7 @@ impl Output {
         drop(out);
         // After a power cut there is the old file or the whole new one.
         file.as_file().sync_all().with_context(in_place)?;
-        file.persist(&self.path).map_err(|error| error.error).with_context(in_place)?;
+        file.persist(path).map_err(|error| error.error).with_context(in_place)?;
         // Some file systems cannot sync a folder; the picture is written all the same.
         let _ = File::open(self.folder()).and_then(|folder| folder.sync_all());
         Ok(())

@@ -1,7 +1,7 @@
 //! `rtfarm render`: a picture by this machine alone, or by a cluster's nodes.
 
 use std::{
-    collections::VecDeque,
+    collections::{BTreeSet, VecDeque},
     io::{self, Seek, Write},
     sync::{Arc, Mutex},
     time::Duration,
@@ -17,8 +17,9 @@ use rtfarm_core::{
     transfer::Transfer,
 };
 use rtfarm_job::{Order, Outcome, Progress, Provenance, Refusal};
-use rtfarm_picture::{Canvas, Notes};
+use rtfarm_picture::{Canvas, Notes, PictureReader};
 use rtfarm_proto::Address;
+use rustix::system::uname;
 use tokio::{
     net::UnixListener,
     sync::watch,
@@ -41,7 +42,9 @@ use crate::{
     private_folder::PrivateFolder,
     resume::{Begun, Resume},
     scene_files::SceneFiles,
-    show, slurm,
+    show,
+    sidecar::Making,
+    slurm,
     source::SceneText,
 };
 
@@ -58,9 +61,17 @@ pub(crate) struct Summary {
     /// From the first lease to the last tile.
     pub(crate) rendering: Duration,
     pub(crate) workers: usize,
+    /// Where they ran.
+    pub(crate) hosts: Arc<BTreeSet<String>>,
 }
 
 impl Summary {
+    /// What the file beside the picture is to say.
+    pub(crate) fn making(&self) -> Making {
+        let Self { tally, rendering, workers, .. } = *self;
+        Making { rendering, workers, hosts: self.hosts.as_ref().clone(), tally }
+    }
+
     /// What there is to say of light that lies too deep.
     fn depth_text(&self) -> String {
         let Tally { samples, untraced, most_untraced, .. } = self.tally;
@@ -171,6 +182,27 @@ impl Drawn {
     }
 }
 
+/// What this program's picture of an order depends on.
+fn provenance(order: &Order) -> Provenance {
+    Provenance {
+        build: software(),
+        scene: order.prepared.hash(),
+        settings: order.settings,
+        grid: order.grid,
+        transfer: order.transfer,
+        format: order.format,
+    }
+}
+
+/// Says whether a picture is in its place, with what stands beside it, and nothing of it is left to do.
+fn is_there(output: &Output, wanted: &Provenance, has_sidecar: bool) -> bool {
+    let is_whole = !Resume::folder(output).exists();
+    let has_all = !has_sidecar || Making::path(output).exists();
+    let reader = PictureReader::open(output.path());
+    let found = reader.ok().and_then(|reader| Provenance::read(&reader.notes().provenance).ok());
+    is_whole && has_all && found.as_ref() == Some(wanted)
+}
+
 /// This program's version and build.
 pub(crate) fn software() -> String {
     format!("{VERSION} ({BUILD})")
@@ -212,7 +244,7 @@ pub(crate) async fn run(
         wanted.push_back((picture, output));
     }
     let mut render = Render { args: &args, console, stop, coordinator: None, told: started.into() };
-    let first = render.place_next(&mut wanted).await?.expect("there is one at least");
+    let Some(first) = render.place_next(&mut wanted).await? else { return Ok(()) };
     match args.workers_and_threads() {
         (0, _) if args.slurm.is_none() => {
             let (last, end) = render.all_but_the_last(first, wanted).await?;
@@ -224,18 +256,26 @@ pub(crate) async fn run(
 }
 
 impl Render<'_> {
-    /// Reads the next scene and begins its picture, if there is one.
+    /// Reads the next scene and begins its picture, if there is one. Frames that an earlier render with
+    /// --resume has finished are passed over.
     async fn place_next(&self, wanted: &mut Wanted) -> Result<Option<Frame>, Failure> {
-        let Some((picture, output)) = wanted.pop_front() else { return Ok(None) };
         let (console, stop) = (self.console, self.stop);
-        let text = SceneText::read(&picture.scene, stop).await?;
-        let has_cache = !self.args.no_cache;
-        let mut order = place(&picture, &output, text, has_cache, console, stop).await?;
-        if let Some(time) = self.args.time {
-            order = choose_quality(order, time, self.args, stop).await?;
+        while let Some((picture, output)) = wanted.pop_front() {
+            let text = SceneText::read(&picture.scene, stop).await?;
+            let has_cache = !self.args.no_cache;
+            let mut order = place(&picture, &output, text, has_cache, console, stop).await?;
+            if let Some(time) = self.args.time {
+                order = choose_quality(order, time, self.args, stop).await?;
+            }
+            let may_be_there = self.args.resume && self.args.frames.is_some();
+            if may_be_there && is_there(&output, &provenance(&order), picture.sidecar) {
+                tracing::info!("{} is there already", output.name().display());
+                continue;
+            }
+            let (order, begun, resume) = begin(order, &output, self.args.resume).await?;
+            return Ok(Some(Frame { order, begun, output, resume }));
         }
-        let (order, begun, resume) = begin(order, &output, self.args.resume).await?;
-        Ok(Some(Frame { order, begun, output, resume }))
+        Ok(None)
     }
 
     /// Renders pictures one after the other: while one is rendered the last is written, and the next is
@@ -294,30 +334,25 @@ impl Render<'_> {
     async fn render(&self, started: Started) -> Result<Rendered, Failure> {
         let Started { size, sampling, transfer, output, resume, work } = started;
         let mut workers = self.args.workers_and_threads().0;
-        let (picture, tally, rendering) = match work {
+        let (picture, tally, rendering, hosts) = match work {
             Work::Here(ordered) => {
                 let (order, begun) = *ordered;
-                let provenance = Provenance {
-                    build: software(),
-                    scene: order.prepared.hash(),
-                    settings: order.settings,
-                    grid: order.grid,
-                    transfer: order.transfer,
-                    format: order.format,
-                };
+                let provenance = provenance(&order);
                 let (canvas, tally, rendering) = self.render_here(order, begun).await?;
-                (Drawn::Here(Box::new((canvas, provenance))), tally, rendering)
+                let host = uname().nodename().to_string_lossy().into_owned();
+                let hosts = Arc::new(BTreeSet::from([host]));
+                (Drawn::Here(Box::new((canvas, provenance))), tally, rendering, hosts)
             }
             Work::Job(job) => {
                 let rendering = wait(&job, self.console).await?;
-                let Progress { tally, worker_count, .. } = *job.progress().borrow();
+                let Progress { tally, worker_count, hosts, .. } = job.progress().borrow().clone();
                 if self.args.slurm.is_some() {
                     workers = worker_count as usize;
                 }
-                (Drawn::Job(job), tally, rendering)
+                (Drawn::Job(job), tally, rendering, hosts)
             }
         };
-        let summary = Summary { size, tally, sampling, transfer, rendering, workers };
+        let summary = Summary { size, tally, sampling, transfer, rendering, workers, hosts };
         Ok(Rendered { summary, output, resume, picture })
     }
 
@@ -328,7 +363,8 @@ impl Render<'_> {
             Drawn::Here(..) => None,
             Drawn::Job(job) => Some(job.id()),
         };
-        write_picture(&output, self.stop, picture).await?;
+        let making = self.args.picture.sidecar.then(|| summary.making());
+        write_picture(&output, self.stop, picture, making).await?;
         if let (Some(coordinator), Some(job)) = (&self.coordinator, job) {
             if self.args.show {
                 // Who watches sees the end.
@@ -627,14 +663,18 @@ async fn wait(job: &Job, console: &Console) -> Result<Duration, Failure> {
     }
 }
 
-/// Encodes a picture into its file.
+/// Encodes a picture into its file, and writes the one beside it.
 async fn write_picture(
     output: &Output,
     stop: &CancellationToken,
     drawn: Drawn,
+    making: Option<Making>,
 ) -> Result<(), Failure> {
     let (output, token) = (output.clone(), stop.clone());
-    let written = spawn_blocking(move || output.write(&token, |file| drawn.encode(file)));
+    let written = spawn_blocking(move || {
+        output.write(&token, |file| drawn.encode(file))?;
+        making.map_or(Ok(()), |making| making.write(&output, &token))
+    });
     match written.await? {
         Err(_) if stop.is_cancelled() => Err(Failure::Interrupted),
         written => Ok(written?),

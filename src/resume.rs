@@ -36,9 +36,14 @@ pub(crate) struct Resume {
 }
 
 impl Resume {
+    /// The folder of a picture that is under way.
+    pub(crate) fn folder(output: &Output) -> PathBuf {
+        output.beside(".rtfarm")
+    }
+
     /// Takes up the picture that an order left, or begins it. Never call this on the async runtime.
     pub(crate) fn open(output: &Output, order: &Order) -> anyhow::Result<(Self, Begun)> {
-        let folder = output.beside(".rtfarm");
+        let folder = Self::folder(output);
         let in_place = || format!("cannot keep the picture under way in {}", folder.display());
         let lock = lock(&folder).with_context(in_place)?;
         let (resume, about) = (Self { folder: folder.clone(), _lock: lock }, about(order));

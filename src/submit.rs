@@ -64,7 +64,15 @@ pub(crate) async fn run(
             return queue::tell(args.json, &json, &job.to_string());
         }
     };
-    let Finished { size, tally, worker_count, rendering } = finished;
+    let Finished { size, tally, worker_count, hosts, rendering } = finished;
+    let request = args.picture.request(output.format());
+    let (sampling, transfer) = (request.quality.sampling, request.transfer);
+    let (workers, hosts) = (worker_count as usize, Arc::new(hosts.into_iter().collect()));
+    let summary = Summary { size, tally, sampling, transfer, rendering, workers, hosts };
+    if args.picture.sidecar {
+        let (making, output, stop) = (summary.making(), output.clone(), stop.clone());
+        spawn_blocking(move || making.write(&output, &stop)).await??;
+    }
     if args.json {
         let mut json = queue::picture_json(job.0, output.name(), Some(size));
         json["seconds"] = rendering.as_secs_f64().into();
@@ -74,12 +82,7 @@ pub(crate) async fn run(
         json["error"] = tally.error().into();
         return queue::tell(true, &json, "");
     }
-    let request = args.picture.request(output.format());
-    let (sampling, transfer) = (request.quality.sampling, request.transfer);
-    let workers = worker_count as usize;
-    Summary { size, tally, sampling, transfer, rendering, workers }
-        .tell(started, &output, console)?;
-    Ok(())
+    Ok(summary.tell(started, &output, console)?)
 }
 
 /// A key that no other order has.

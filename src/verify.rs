@@ -114,6 +114,17 @@ fn verify(
             reader.format()
         ));
     }
+    for (option, word, wanted) in args.settings.said() {
+        let mut lines = said.lines().filter_map(|line| line.split_once(' '));
+        let there = lines.find(|(there, _)| *there == word).map(|(_, value)| value);
+        if there != Some(&wanted) {
+            let there =
+                there.map_or("does not say it".to_owned(), |value| format!("says {word} {value}"));
+            differences.push(format!(
+                "the settings differ: --{option} makes {word} {wanted}, the picture {there}"
+            ));
+        }
+    }
     let order = prepare(args, text, &provenance)?;
     if order.prepared.hash() != scene {
         differences.push(format!(

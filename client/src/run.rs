@@ -409,6 +409,7 @@ fn read_event(event: wire::Event) -> Result<JobState, Trouble> {
         tile_count: event.tile_count,
         tally: Tally::try_from(event.tally.unwrap_or_default()).map_err(nonsense)?,
         worker_count: event.workers,
+        hosts: event.hosts.iter().map(|host| plain(host)).collect(),
         differing_tiles: event.differing_tiles,
         obstacle: plain(&event.obstacle),
         left: time_left(event.left),

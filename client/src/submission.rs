@@ -66,6 +66,8 @@ pub struct JobState {
     pub tally: Tally,
     /// Workers that have delivered something.
     pub worker_count: u32,
+    /// Their hosts, once the job has ended.
+    pub hosts: Vec<String>,
     /// Tiles with a second copy that differed from the first.
     pub differing_tiles: u32,
     /// Why the job does not get further, unless that may change by itself; otherwise empty.
@@ -94,6 +96,8 @@ pub struct Finished {
     pub tally: Tally,
     /// Workers that brought tiles.
     pub worker_count: u32,
+    /// Their hosts.
+    pub hosts: Vec<String>,
     /// From the job's start to its last tile.
     pub rendering: Duration,
 }
@@ -328,8 +332,8 @@ impl Submission {
                 if state.differing_tiles > 0 {
                     self.actions.push_back(Action::WarnOfDifferingTiles(state.differing_tiles));
                 }
-                let JobState { tally, worker_count, .. } = state;
-                let finished = Finished { size, tally, worker_count, rendering };
+                let JobState { tally, worker_count, hosts, .. } = state;
+                let finished = Finished { size, tally, worker_count, hosts, rendering };
                 let fetching = Stage::Fetching { job, finished };
                 self.enter(fetching, Action::Fetch(job), now + IMAGE_DEADLINE);
             }
@@ -505,6 +509,7 @@ mod tests {
             tile_count,
             tally,
             worker_count: 2,
+            hosts: vec!["host".to_owned()],
             differing_tiles: 0,
             obstacle,
             left: None,
@@ -620,7 +625,13 @@ mod tests {
         let (names, end) = bench.actions();
         assert_eq!(names, [""; 0]);
         let tally = Tally { rays: 5, ..Tally::default() };
-        let expected = Finished { size: size(), tally, worker_count: 2, rendering: SECOND };
+        let expected = Finished {
+            size: size(),
+            tally,
+            worker_count: 2,
+            hosts: vec!["host".to_owned()],
+            rendering: SECOND,
+        };
         let end = end.expect("an end").expect("a picture");
         assert_eq!(end, Ended::Finished(JOB, expected));
     }

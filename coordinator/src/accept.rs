@@ -5,7 +5,10 @@ use std::{
     io,
     net::SocketAddr,
     pin::Pin,
-    sync::{Arc, Mutex},
+    sync::{
+        Arc, Mutex,
+        atomic::{AtomicBool, Ordering},
+    },
     task::{Context, Poll},
     time::Duration,
 };
@@ -16,6 +19,7 @@ use tokio::{
     sync::{OwnedSemaphorePermit, Semaphore, mpsc},
     time::{Sleep, sleep},
 };
+use tokio_rustls::server::TlsStream;
 use tonic::transport::server::Connected;
 
 /// How connections of strangers are limited.
@@ -45,9 +49,22 @@ pub(crate) struct Peer {
     pub(crate) is_local: bool,
     /// Its place among the strangers, until it has shown a token. `None` where none is asked for.
     place: Option<Arc<Mutex<Option<OwnedSemaphorePermit>>>>,
+    /// Nothing is to be said to it or heard of it any more.
+    is_cut_off: Arc<AtomicBool>,
 }
 
 impl Peer {
+    fn new(is_local: bool, permit: Option<OwnedSemaphorePermit>) -> Self {
+        let place = permit.map(|permit| Mutex::new(Some(permit)).into());
+        Self { is_local, place, is_cut_off: Arc::default() }
+    }
+
+    /// Has its connection closed, when that is next looked at: in ten seconds at the latest, by which
+    /// connections show that they are alive.
+    pub(crate) fn cut_off(&self) {
+        self.is_cut_off.store(true, Ordering::Relaxed);
+    }
+
     /// It has shown a token: its place is another one's.
     pub(crate) fn admit(&self) {
         if let Some(place) = &self.place {
@@ -99,6 +116,14 @@ impl<S> Greeted<S> {
     }
 }
 
+impl<S> Greeted<TlsStream<Greeted<S>>> {
+    /// A connection whose hands are shaken; what lies below keeps the time.
+    pub(crate) fn around(stream: TlsStream<Greeted<S>>) -> Self {
+        let peer = stream.get_ref().0.peer.clone();
+        Self { stream, peer, deadline: None }
+    }
+}
+
 /// Whom to let in.
 #[derive(Debug, Clone)]
 pub(crate) struct Door {
@@ -129,8 +154,7 @@ pub(crate) async fn accept_all<S>(
             Ok(stream) => {
                 pause = FIRST_PAUSE;
                 let is_local = door.is_local;
-                let peer =
-                    Peer { is_local, place: permit.map(|permit| Mutex::new(Some(permit)).into()) };
+                let peer = Peer::new(is_local, permit);
                 place.send(Ok(Greeted::new(stream, peer, door.limits.first_word)));
             }
             Err(error) => {
@@ -148,6 +172,9 @@ impl<S: AsyncRead + Unpin> AsyncRead for Greeted<S> {
         context: &mut Context<'_>,
         buffer: &mut ReadBuf<'_>,
     ) -> Poll<io::Result<()>> {
+        if self.peer.is_cut_off.load(Ordering::Relaxed) {
+            return Poll::Ready(Err(io::ErrorKind::ConnectionAborted.into()));
+        }
         let is_stranger = self.peer.is_stranger();
         if self.peer.place.is_some() && !is_stranger {
             // It has shown a token.
@@ -213,7 +240,7 @@ mod tests {
     use super::*;
 
     fn peer(permit: Option<OwnedSemaphorePermit>) -> Peer {
-        Peer { is_local: false, place: permit.map(|permit| Mutex::new(Some(permit)).into()) }
+        Peer::new(false, permit)
     }
 
     async fn read(stream: &mut Greeted<UnixStream>) -> io::Result<usize> {
@@ -237,7 +264,7 @@ mod tests {
         timeout(4 * patience, read(&mut stream)).await.expect_err("it is waited for");
     }
 
-    #[tokio::test]
+    #[tokio::test(start_paused = true)]
     async fn connections_that_cannot_be_accepted_are_tried_again_after_a_pause() {
         let mut attempts = 0;
         let accept = |_: &mut Context<'_>| {

@@ -4,6 +4,7 @@
 
 use std::{
     collections::{BTreeMap, BTreeSet},
+    sync::Arc,
     time::{Duration, Instant},
 };
 
@@ -763,6 +764,11 @@ impl Farm {
         let delivery = storing.first;
         let Delivery { worker, hash, .. } = delivery;
         let the_first = job.contributors.insert(worker);
+        if let Some(host) = self.members.host(worker)
+            && !job.progress.hosts.contains(host)
+        {
+            Arc::make_mut(&mut job.progress.hosts).insert(host.to_owned());
+        }
         self.members.on_tile(worker);
         job.progress.tiles_done = done;
         job.progress.tally.add(&delivery.tally);

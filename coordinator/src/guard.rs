@@ -6,7 +6,11 @@ use std::{
     pin::Pin,
     sync::Arc,
     task::{Context, Poll},
+    time::Duration,
 };
+
+use rtfarm_proto::MESSAGE_BYTES;
+use tokio::time::timeout;
 
 use tonic::{
     Status,
@@ -18,18 +22,25 @@ use tonic::{
     server::NamedService,
 };
 
-use crate::{accept::Peer, security::Security};
+use crate::{accept::Peer, flight::Flight, security::Security};
+
+/// The call that brings pixels.
+const DELIVER: &str = "/rtfarm.v1.Farm/Deliver";
+
+/// A worker waits for no answer that long.
+const DELIVERY_DEADLINE: Duration = Duration::from_secs(60);
 
 /// A service whose callers must show a token, unless there is nobody to ask for one.
 #[derive(Clone)]
 pub(crate) struct Guarded<S> {
     service: S,
     security: Option<Arc<Security>>,
+    arriving: Flight,
 }
 
 impl<S> Guarded<S> {
-    pub(crate) fn new(service: S, security: Option<Arc<Security>>) -> Self {
-        Self { service, security }
+    pub(crate) fn new(service: S, security: Option<Arc<Security>>, arriving: Flight) -> Self {
+        Self { service, security, arriving }
     }
 }
 
@@ -42,6 +53,7 @@ type Answering = Pin<Box<dyn Future<Output = Result<Response<Body>, Infallible>>
 impl<S> Service<Request<Body>> for Guarded<S>
 where
     S: Service<Request<Body>, Response = Response<Body>, Error = Infallible, Future = Answering>,
+    S: Clone + Send + 'static,
 {
     type Response = Response<Body>;
     type Error = Infallible;
@@ -72,6 +84,15 @@ where
                 peer.admit();
             }
         }
-        self.service.call(request)
+        if request.uri().path() != DELIVER {
+            return self.service.call(request);
+        }
+        let (mut service, arriving) = (self.service.clone(), self.arriving.clone());
+        Box::pin(async move {
+            let _room = arriving.take(MESSAGE_BYTES).await;
+            let answered = timeout(DELIVERY_DEADLINE, service.call(request)).await;
+            let late = |_| Ok(Status::deadline_exceeded("the pixels do not come").into_http());
+            answered.unwrap_or_else(late)
+        })
     }
 }

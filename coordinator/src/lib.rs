@@ -18,6 +18,7 @@ mod accept;
 mod audit;
 mod events;
 mod farm;
+mod flight;
 mod guard;
 mod identity;
 mod job;

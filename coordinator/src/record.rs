@@ -1,6 +1,6 @@
 //! What a farm's state says of a job and of the farm, as it stands in files.
 
-use std::collections::BTreeMap;
+use std::{collections::BTreeMap, sync::Arc};
 
 use prost::Message;
 use rtfarm_core::{
@@ -226,6 +226,7 @@ pub(crate) fn to_event(progress: &Progress) -> wire::Event {
         tile_count: progress.tile_count,
         tally: Some(progress.tally.into()),
         workers: progress.worker_count,
+        hosts: progress.outcome.iter().flat_map(|_| progress.hosts.iter().cloned()).collect(),
         differing_tiles: progress.differing_tiles,
         obstacle: progress.obstacle.clone().unwrap_or_default(),
         left: progress.left.map(|left| wire::TimeLeft {
@@ -254,6 +255,7 @@ pub(crate) fn to_progress(event: &wire::Event) -> Result<Progress, RecordError> 
         tile_count: event.tile_count,
         tally: Tally::try_from(event.tally.unwrap_or_default())?,
         worker_count: event.workers,
+        hosts: Arc::new(event.hosts.iter().cloned().collect()),
         differing_tiles: event.differing_tiles,
         outcome,
         ..Progress::default()

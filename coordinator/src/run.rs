@@ -15,13 +15,15 @@ use tokio::{
     io::{AsyncRead, AsyncWrite},
     net::{TcpListener, TcpStream, UnixListener},
     sync::{Semaphore, mpsc},
+    time::timeout,
 };
+use tokio_rustls::{TlsAcceptor, server::TlsStream};
 use tokio_stream::wrappers::ReceiverStream;
 use tokio_util::sync::CancellationToken;
 use tonic::transport::server::Router;
 
 use crate::{
-    accept::{Door, Limits, WAITING, accept_all},
+    accept::{Door, Greeted, Limits, WAITING, accept_all},
     identity::Identity,
     job::Job,
     record::Ticket,
@@ -169,20 +171,57 @@ async fn serve(
             let accept = |context: &mut Context<'_>| {
                 listener.poll_accept(context).map_ok(|(stream, _)| stream)
             };
-            let router = service::router(shell, None, None)?;
+            let router = service::router(shell, None);
             Ok(serve_accepted(router, accept, door(true), stop).await?)
         }
         Listener::Tcp(listener) => {
-            let router = service::router(shell, None, None)?;
+            let router = service::router(shell, None);
             Ok(serve_accepted(router, accept_tcp(&listener), door(false), stop).await?)
         }
         Listener::Tls(listener, security, limits) => {
-            let tls = security.tls(limits.handshake)?;
-            let router = service::router(shell, Some(Arc::new(security)), Some(tls))?;
+            let tls = security.tls()?;
+            let router = service::router(shell, Some(Arc::new(security)));
             let places = Some(Arc::new(Semaphore::new(limits.strangers)));
             let door = Door { is_local: false, limits, places };
-            Ok(serve_accepted(router, accept_tcp(&listener), door, stop).await?)
+            let (send, connections) = mpsc::channel(WAITING);
+            let (send_secured, secured) = mpsc::channel(WAITING);
+            let secured = ReceiverStream::new(secured);
+            let serve = router.serve_with_incoming_shutdown(secured, stop.cancelled_owned());
+            let (served, (), ()) = tokio::join!(
+                serve,
+                accept_all(accept_tcp(&listener), door, send),
+                shake_hands(connections, tls, limits.handshake, send_secured),
+            );
+            Ok(served?)
         }
+    }
+}
+
+/// Has those who connect speak TLS, and hands on those who do in time, until nobody takes them any more.
+async fn shake_hands<S: AsyncRead + AsyncWrite + Unpin + Send + 'static>(
+    mut connections: mpsc::Receiver<io::Result<Greeted<S>>>,
+    tls: TlsAcceptor,
+    patience: Duration,
+    send: mpsc::Sender<io::Result<Greeted<TlsStream<Greeted<S>>>>>,
+) {
+    loop {
+        let connection = tokio::select! {
+            connection = connections.recv() => connection,
+            () = send.closed() => return,
+        };
+        let Some(Ok(connection)) = connection else { return };
+        let (handshake, send) = (tls.accept(connection), send.clone());
+        tokio::spawn(async move {
+            match timeout(patience, handshake).await {
+                Ok(Ok(stream)) => {
+                    let secured = Greeted::around(stream);
+                    // When nobody takes it the coordinator stops.
+                    let _ = send.send(Ok(secured)).await;
+                }
+                Ok(Err(error)) => tracing::debug!(reason = %error, "a handshake failed"),
+                Err(_) => tracing::debug!("a handshake took too long"),
+            }
+        });
     }
 }
 
@@ -218,12 +257,16 @@ mod tests {
     use std::fs;
 
     use rtfarm_proto::{Access, Address};
+    use tempfile::TempDir;
+    use tokio::task::JoinHandle;
 
     use super::*;
     use crate::{farm::Keeping, security::make_certificates, upload::OrderLimits};
 
-    /// What becomes of a connection to a coordinator whose certificate is good to that day.
-    async fn connect(last_day: (i32, u8, u8)) -> Result<(), String> {
+    /// How a coordinator is reached, whose certificate is good to that day, who serves it, and its folder.
+    async fn start(
+        last_day: (i32, u8, u8),
+    ) -> (Access, JoinHandle<Result<(), ServeError>>, TempDir) {
         let state = tempfile::tempdir().unwrap();
         let folder = state.path().join("access");
         fs::create_dir(&folder).unwrap();
@@ -252,6 +295,12 @@ mod tests {
         let serving =
             tokio::spawn(async move { coordinator.run(listener, std::future::pending()).await });
         let access = Access::read(&fs::read_to_string(folder.join("read")).unwrap()).unwrap();
+        (access, serving, state)
+    }
+
+    /// What becomes of a connection to a coordinator whose certificate is good to that day.
+    async fn connect(last_day: (i32, u8, u8)) -> Result<(), String> {
+        let (access, serving, _state) = start(last_day).await;
         let connected = access.connect().await;
         serving.abort();
         connected.map(drop).map_err(|error| with_reasons(&error))
@@ -268,5 +317,50 @@ mod tests {
         assert_eq!(connect((4096, 1, 1)).await, Ok(()));
         let refused = connect((2020, 1, 1)).await.unwrap_err();
         assert!(refused.contains("expired"), "{refused}");
+    }
+
+    /// A browser that asks for HTTP/2 gets it, one that asks for HTTP/1.1 or for nothing gets that.
+    #[tokio::test]
+    async fn a_page_is_shown_in_http_1_over_tls_too() {
+        use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
+        use tokio_rustls::{
+            TlsConnector,
+            rustls::{
+                ClientConfig, RootCertStore,
+                pki_types::{CertificateDer, ServerName, pem::PemObject as _},
+            },
+        };
+        let (access, serving, _state) = start((4096, 1, 1)).await;
+        let text = access.text().unwrap();
+        let authority = CertificateDer::from_pem_slice(text.as_bytes()).unwrap();
+        let mut roots = RootCertStore::empty();
+        roots.add(authority).unwrap();
+        let address = access.address().to_string().replace("https://", "");
+        for (asked, chosen) in [
+            (&["h2", "http/1.1"][..], Some(&b"h2"[..])),
+            (&["http/1.1"], Some(b"http/1.1")),
+            (&[], None),
+        ] {
+            let config = ClientConfig::builder().with_root_certificates(roots.clone());
+            let mut config = config.with_no_client_auth();
+            config.alpn_protocols = asked.iter().map(|&name| Vec::from(name)).collect();
+            let tcp = TcpStream::connect(&address).await.unwrap();
+            let name = ServerName::try_from("rtfarm").unwrap();
+            let connector = TlsConnector::from(Arc::new(config));
+            let mut stream = connector.connect(name, tcp).await.unwrap();
+            assert_eq!(stream.get_ref().1.alpn_protocol(), chosen);
+            if chosen == Some(b"h2") {
+                continue;
+            }
+            let ask = format!("GET / HTTP/1.1\r\nHost: {address}\r\nConnection: close\r\n\r\n");
+            stream.write_all(ask.as_bytes()).await.unwrap();
+            let mut answer = Vec::new();
+            // Not everybody says farewell in TLS.
+            let _ = stream.read_to_end(&mut answer).await;
+            let answer = String::from_utf8_lossy(&answer).to_lowercase();
+            assert!(answer.starts_with("http/1.1 200 "), "{answer}");
+            assert!(answer.contains("<!doctype html>"), "{answer}");
+        }
+        serving.abort();
     }
 }

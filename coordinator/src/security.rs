@@ -17,7 +17,7 @@ use std::{
     os::unix::fs::{DirBuilderExt, MetadataExt},
     path::{Path, PathBuf},
     str::FromStr,
-    sync::Mutex,
+    sync::{Arc, Mutex},
     time::Duration,
 };
 
@@ -29,10 +29,14 @@ use rcgen::{
 use rtfarm_proto::{Access, Address, CERTIFIED_NAME};
 use tempfile::NamedTempFile;
 use tokio::time::Instant;
-use tonic::{
-    Code, Status,
-    transport::{Identity, ServerTlsConfig},
+use tokio_rustls::{
+    TlsAcceptor,
+    rustls::{
+        ServerConfig,
+        pki_types::{CertificateDer, PrivateKeyDer, pem::PemObject as _},
+    },
 };
+use tonic::{Code, Status};
 
 const FOLDER: &str = "access";
 const AUTHORITY: &str = "authority";
@@ -187,10 +191,17 @@ impl Security {
         Ok(Self { folder, known: Mutex::new(known) })
     }
 
-    /// What the coordinator shows to those who connect; they have so long to shake hands.
-    pub(crate) fn tls(&self, handshake: Duration) -> Result<ServerTlsConfig, io::Error> {
-        let pem = fs::read_to_string(self.folder.join(CERTIFICATE))?;
-        Ok(ServerTlsConfig::new().identity(Identity::from_pem(&pem, &pem)).timeout(handshake))
+    /// What the coordinator shows to those who connect: workers and clients speak HTTP/2, browsers that
+    /// or HTTP/1.1.
+    pub(crate) fn tls(&self) -> io::Result<TlsAcceptor> {
+        let pem = fs::read(self.folder.join(CERTIFICATE))?;
+        let chain = CertificateDer::pem_slice_iter(&pem).collect::<Result<Vec<_>, _>>();
+        let chain = chain.map_err(io::Error::other)?;
+        let key = PrivateKeyDer::from_pem_slice(&pem).map_err(io::Error::other)?;
+        let config = ServerConfig::builder().with_no_client_auth().with_single_cert(chain, key);
+        let mut config = config.map_err(io::Error::other)?;
+        config.alpn_protocols = ["h2", "http/1.1"].map(Vec::from).into();
+        Ok(TlsAcceptor::from(Arc::new(config)))
     }
 
     /// Says as whom who shows this `Authorization` may call that method. A file of tokens that was
@@ -439,7 +450,7 @@ mod tests {
         assert_eq!(before.len(), 2);
         let security = Security::open(state.path(), &address()).unwrap();
         assert_eq!(files(), before);
-        security.tls(Duration::from_secs(5)).unwrap();
+        security.tls().unwrap();
     }
 
     #[test]

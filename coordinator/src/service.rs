@@ -5,6 +5,7 @@ use std::{
     io::{self, BufWriter, Read, Seek},
     pin::Pin,
     sync::Arc,
+    task::{Context, Poll, ready},
     time::Duration,
 };
 
@@ -24,13 +25,13 @@ use rtfarm_proto::{
     },
 };
 use rustix::io::Errno;
-use tokio::sync::{mpsc, oneshot};
+use tokio::sync::{Notify, OwnedSemaphorePermit, mpsc, oneshot};
 use tokio_stream::{Stream, wrappers::ReceiverStream};
 use tokio_util::sync::CancellationToken;
 use tonic::{
     Request, Response, Status, Streaming,
     service::Routes,
-    transport::{Server, ServerTlsConfig, server::Router},
+    transport::{Server, server::Router},
 };
 
 use crate::{
@@ -52,6 +53,9 @@ use crate::{
 /// The most bytes that a scene and its files may have.
 const LONGEST_BUNDLE: u64 = 1 << 31;
 
+/// The longest message of a client: a piece of a scene, or of a file with its path.
+const PIECE_BYTES: usize = CHUNK_BYTES + (1 << 16);
+
 /// A watching client hears of changes no more often than this.
 const WATCH_PERIOD: Duration = Duration::from_millis(50);
 
@@ -62,11 +66,7 @@ type Chunks = Pin<Box<dyn Stream<Item = Result<wire::Chunk, Status>> + Send>>;
 type Events = Pin<Box<dyn Stream<Item = Result<wire::Event, Status>> + Send>>;
 
 /// Both services over one coordinator and its page, for those who have a token if there is `security`.
-pub(crate) fn router(
-    shell: &Arc<Shell>,
-    security: Option<Arc<Security>>,
-    tls: Option<ServerTlsConfig>,
-) -> Result<Router, tonic::transport::Error> {
+pub(crate) fn router(shell: &Arc<Shell>, security: Option<Arc<Security>>) -> Router {
     const WINDOW_BYTES: u32 = 1 << 22;
     // A frame of a delivery; each costs both sides a call of the system.
     const FRAME_BYTES: u32 = 1 << 17;
@@ -75,24 +75,21 @@ pub(crate) fn router(
     let (reporter, health) = tonic_health::server::health_reporter();
     drop(reporter);
     let keeper = security.clone().map_or(Keeper::Nobody, Keeper::Farm);
-    let routes = Routes::new(Guarded::new(farm, security.clone()))
-        .add_service(Guarded::new(jobs, security))
+    let arriving = shell.arriving.clone();
+    let routes = Routes::new(Guarded::new(farm, security.clone(), arriving.clone()))
+        .add_service(Guarded::new(jobs, security, arriving))
         .add_service(health)
         .into_axum_router()
         .fallback_service(Page::new(shell, keeper));
-    let server = match tls {
-        Some(tls) => Server::builder().tls_config(tls)?,
-        None => Server::builder(),
-    };
-    Ok(server
+    Server::builder()
         .initial_stream_window_size(WINDOW_BYTES)
         .initial_connection_window_size(WINDOW_BYTES)
         .max_frame_size(FRAME_BYTES)
         .http2_keepalive_interval(Some(Duration::from_secs(10)))
         .http2_keepalive_timeout(Some(Duration::from_secs(20)))
-        // Browsers speak it where nothing is encrypted.
+        // Browsers speak it where nothing is encrypted, and may elsewhere.
         .accept_http1(true)
-        .add_routes(routes.into()))
+        .add_routes(routes.into())
 }
 
 /// The page alone, for those who have this token.
@@ -113,7 +110,7 @@ pub(crate) fn services(
         shell: Arc::clone(shell),
         uploads: Uploads::default(),
     })
-    .max_decoding_message_size(MESSAGE_BYTES)
+    .max_decoding_message_size(PIECE_BYTES)
     .max_encoding_message_size(MESSAGE_BYTES);
     (farm, jobs)
 }
@@ -223,6 +220,7 @@ impl farm_server::Farm for FarmService {
         &self,
         request: Request<wire::FetchRequest>,
     ) -> Result<Response<Chunks>, Status> {
+        let peer = request.extensions().get::<Peer>().cloned();
         let wire::FetchRequest { scene_hash: hash, incarnation } = request.into_inner();
         self.shell.admit(incarnation).map_err(stranger)?;
         let hash = scene_hash(&hash).map_err(invalid)?;
@@ -233,7 +231,7 @@ impl farm_server::Farm for FarmService {
             io::ErrorKind::NotFound => Status::not_found("no job has this scene now"),
             _ => broken(&error),
         })?;
-        Ok(Response::new(stream_file(file, job)))
+        Ok(Response::new(stream_file(file, job, peer, &self.shell)))
     }
 }
 
@@ -389,6 +387,7 @@ impl jobs_server::Jobs for JobsService {
         &self,
         request: Request<wire::ImageRequest>,
     ) -> Result<Response<Chunks>, Status> {
+        let peer = request.extensions().get::<Peer>().cloned();
         let wire::ImageRequest { job, farm, partial } = request.into_inner();
         let job = self.job(job, &farm)?;
         if !partial && !matches!(job.progress.borrow().outcome, Some(Outcome::Finished(_))) {
@@ -412,7 +411,7 @@ impl jobs_server::Jobs for JobsService {
             }
         })
         .await?;
-        Ok(Response::new(stream_file(encoded, job)))
+        Ok(Response::new(stream_file(encoded, job, peer, &self.shell)))
     }
 
     async fn cancel(
@@ -673,6 +672,8 @@ async fn receive(
     shell: &Shell,
     uploads: &Uploads,
 ) -> Result<Received, Status> {
+    // A piece that is decoded, and one that is written.
+    let _room = shell.arriving.take(2 * PIECE_BYTES).await;
     let mut parts = Upload { parts, silence: shell.config.upload_silence };
     // What is not wanted is refused before it is sent.
     let Some(submit_request::Part::Order(order)) = parts.next().await?.and_then(|part| part.part)
@@ -772,13 +773,25 @@ fn to_run(run: &Run, job: &Job, is_local: bool) -> wire::Run {
     }
 }
 
-/// Streams a file in pieces; `job` is kept until the last one has gone. A thread is taken for as
-/// long as a piece is read: a reader that takes none holds no thread.
-fn stream_file(file: std::fs::File, job: Arc<Job>) -> Chunks {
-    let (send, receive) = mpsc::channel(2);
+/// Streams a file in pieces; `job` is kept until the last one has gone. A piece is read when the one
+/// before it is on the wire: a reader that takes none holds no thread, and in the end loses its connection.
+fn stream_file(file: std::fs::File, job: Arc<Job>, peer: Option<Peer>, shell: &Shell) -> Chunks {
+    let (send, receive) = mpsc::channel(1);
+    let (flight, silence) = (shell.leaving.clone(), shell.config.upload_silence);
+    let asked = Arc::new(Notify::new());
+    let pieces = Pieces { receive, asked: Arc::clone(&asked), is_asked: false, on_its_way: None };
     tokio::spawn(async move {
         let mut rest = Some(file);
         while let Some(file) = rest.take() {
+            tokio::select! {
+                () = asked.notified() => {}
+                () = send.closed() => break,
+                () = tokio::time::sleep(silence) => {
+                    peer.as_ref().inspect(|peer| peer.cut_off());
+                    break;
+                }
+            }
+            let room = flight.take(CHUNK_BYTES).await;
             let chunk = match blocking(move || read_chunk(file)).await {
                 Ok(None) => break,
                 Ok(Some((file, chunk))) => {
@@ -787,13 +800,38 @@ fn stream_file(file: std::fs::File, job: Arc<Job>) -> Chunks {
                 }
                 Err(status) => Err(status),
             };
-            if send.send(chunk).await.is_err() {
+            if send.send((chunk, room)).await.is_err() {
                 break;
             }
         }
         drop(job);
     });
-    Box::pin(ReceiverStream::new(receive))
+    Box::pin(pieces)
+}
+
+/// Pieces of a file. Each has its room until the next is asked for: then it is on the wire.
+struct Pieces {
+    receive: mpsc::Receiver<(Result<wire::Chunk, Status>, OwnedSemaphorePermit)>,
+    asked: Arc<Notify>,
+    is_asked: bool,
+    on_its_way: Option<OwnedSemaphorePermit>,
+}
+
+impl Stream for Pieces {
+    type Item = Result<wire::Chunk, Status>;
+
+    fn poll_next(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<Option<Self::Item>> {
+        self.on_its_way = None;
+        if !std::mem::replace(&mut self.is_asked, true) {
+            self.asked.notify_one();
+        }
+        let next = ready!(self.receive.poll_recv(context));
+        self.is_asked = false;
+        Poll::Ready(next.map(|(chunk, room)| {
+            self.on_its_way = Some(room);
+            chunk
+        }))
+    }
 }
 
 /// The next piece of a file, and the file; `None` at its end.

@@ -27,6 +27,7 @@ use crate::{
         Action, Arrived, Change, Delivery, DeliveryId, Earlier, Explanation, Farm, JobEntry,
         Keeping, Next, Notice, Refused, Terms, Verdict,
     },
+    flight::Flight,
     identity::{Identity, Stranger},
     job::Job,
     lease::Run,
@@ -112,6 +113,9 @@ pub(crate) struct Shell {
     changing: Mutex<()>,
     /// Held while it is found out whether there is room for an order, and it is taken.
     pub(crate) ordering: Mutex<()>,
+    /// What comes to this process, and what goes.
+    pub(crate) arriving: Flight,
+    pub(crate) leaving: Flight,
     /// Told when the machine wants to be woken earlier than it will be.
     earlier: Notify,
     /// What happened.
@@ -216,6 +220,7 @@ impl Shell {
             last_number: 0,
             wakes_at: None,
         };
+        let [arriving, leaving] = [(); 2].map(|()| Flight::new(config.orders.flight_bytes));
         let shell = Self {
             identity,
             config,
@@ -225,6 +230,8 @@ impl Shell {
             state: Mutex::new(state),
             changing: Mutex::default(),
             ordering: Mutex::default(),
+            arriving,
+            leaving,
             earlier: Notify::new(),
             events,
             stop: CancellationToken::new(),

@@ -25,11 +25,19 @@ pub struct OrderLimits {
     pub bytes: u64,
     /// Bytes of all scenes together that are being sent.
     pub upload_bytes: u64,
+    /// Bytes of messages that are in memory at once, each way.
+    pub flight_bytes: u64,
 }
 
 impl Default for OrderLimits {
     fn default() -> Self {
-        Self { jobs: 1000, pixels: 1 << 34, bytes: 256_000_000_000, upload_bytes: 8_000_000_000 }
+        Self {
+            jobs: 1000,
+            pixels: 1 << 34,
+            bytes: 256_000_000_000,
+            upload_bytes: 8_000_000_000,
+            flight_bytes: 1_000_000_000,
+        }
     }
 }
 
@@ -178,7 +186,8 @@ mod tests {
 
     #[test]
     fn who_orders_too_much_is_told_what_there_is_too_much_of() {
-        let limits = OrderLimits { jobs: 2, pixels: 100, bytes: 1_000_000_000, upload_bytes: 0 };
+        let limits = OrderLimits { jobs: 2, pixels: 100, ..OrderLimits::default() };
+        let limits = OrderLimits { bytes: 1_000_000_000, ..limits };
         let there = Ordered { jobs: 1, pixels: 60, bytes: 500_000_000 };
         let order = Ordered { jobs: 1, pixels: 40, bytes: 500_000_000 };
         assert_eq!(limits.refusal(there, order), None);

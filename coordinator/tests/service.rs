@@ -54,10 +54,11 @@ struct Farm {
 
 impl Farm {
     async fn new() -> Self {
-        Self::with(OrderLimits::default()).await
+        Self::with(OrderLimits::default(), Duration::from_secs(60)).await
     }
 
-    async fn with(orders: OrderLimits) -> Self {
+    /// With such limits, where who says nothing of a scene or takes nothing for that long is given up.
+    async fn with(orders: OrderLimits, upload_silence: Duration) -> Self {
         let folder = tempfile::tempdir().unwrap();
         let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
         let address: Address =
@@ -69,7 +70,7 @@ impl Farm {
             term: Duration::from_millis(300),
             audit: 0.0,
             keeping: Keeping::default(),
-            upload_silence: Duration::from_millis(600),
+            upload_silence,
             events: None,
             begins_coarsely: false,
             host: None,
@@ -102,6 +103,29 @@ impl Farm {
             scene: SceneHash([0; 32]),
             settings: Settings { size: Size::new(16, 8).unwrap(), quality: Quality::default() },
         }
+    }
+
+    /// Renders the job.
+    async fn finish(&mut self) {
+        while self.state().await.end.is_none() {
+            let (lease, tiles) = self.lease().await;
+            for tile in tiles {
+                self.deliver(lease, tile, 0.5).await.unwrap();
+            }
+        }
+    }
+
+    /// Has a scene of some megabytes be the farm's next job.
+    async fn submit_long_scene(&mut self) {
+        let text = long_scene();
+        let pieces = text.as_bytes().chunks(1 << 20).map(|piece| Part::Text(piece.to_vec().into()));
+        let parts: Vec<_> = std::iter::once(Part::Order(order(VERSION)))
+            .chain(pieces)
+            .map(|part| wire::SubmitRequest { part: Some(part) })
+            .collect();
+        let answer = self.jobs.submit(tokio_stream::iter(parts)).await.unwrap().into_inner();
+        let Some(Outcome::Accepted(accepted)) = answer.outcome else { panic!("{answer:?}") };
+        self.job = accepted.job;
     }
 
     async fn lease(&mut self) -> (LeaseName, Vec<u32>) {
@@ -393,21 +417,8 @@ async fn a_client_that_goes_while_its_scene_is_prepared_leaves_no_job() {
 #[tokio::test(flavor = "multi_thread")]
 async fn scenes_that_nobody_takes_keep_no_tile_waiting() {
     let mut farm = Farm::new().await;
-    while farm.state().await.end.is_none() {
-        let (lease, tiles) = farm.lease().await;
-        for tile in tiles {
-            farm.deliver(lease, tile, 0.5).await.unwrap();
-        }
-    }
-    let text = long_scene();
-    let pieces = text.as_bytes().chunks(1 << 20).map(|piece| Part::Text(piece.to_vec().into()));
-    let parts: Vec<_> = std::iter::once(Part::Order(order(VERSION)))
-        .chain(pieces)
-        .map(|part| wire::SubmitRequest { part: Some(part) })
-        .collect();
-    let answer = farm.jobs.submit(tokio_stream::iter(parts)).await.unwrap().into_inner();
-    let Some(Outcome::Accepted(accepted)) = answer.outcome else { panic!("{answer:?}") };
-    farm.job = accepted.job;
+    farm.finish().await;
+    farm.submit_long_scene().await;
     let (lease, tiles) = farm.lease().await;
     let request = wire::FetchRequest {
         scene_hash: farm.scene.0.to_vec().into(),
@@ -423,9 +434,53 @@ async fn scenes_that_nobody_takes_keep_no_tile_waiting() {
     }
     tokio::time::sleep(Duration::from_millis(500)).await;
     let delivering = farm.deliver(lease, tiles[0], 0.5);
-    let delivered = tokio::time::timeout(Duration::from_secs(10), delivering).await;
+    let delivered = tokio::time::timeout(Duration::from_secs(40), delivering).await;
     assert_eq!(delivered.expect("an answer"), Ok(wire::Verdict::Accepted));
     drop(streams);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn what_is_on_its_way_has_so_many_bytes_and_who_takes_nothing_loses_its_connection() {
+    // Room for four pieces each way: two streams have as many on their way.
+    let orders = OrderLimits { flight_bytes: 4 << 20, ..OrderLimits::default() };
+    let mut farm = Farm::with(orders, Duration::from_secs(1)).await;
+    farm.finish().await;
+    farm.submit_long_scene().await;
+    farm.lease().await;
+    let request = wire::FetchRequest {
+        scene_hash: farm.scene.0.to_vec().into(),
+        incarnation: farm.incarnation,
+    };
+    // Who takes nothing has all of it, and is not waited for beyond its patience.
+    let idle = farm.address.connect().await.unwrap();
+    let mut streams = Vec::new();
+    for _ in 0..12 {
+        let mut client = FarmClient::new(idle.clone());
+        streams.push(client.fetch(request.clone()).await.unwrap().into_inner());
+    }
+    let mut client = FarmClient::new(farm.address.connect().await.unwrap());
+    let mut pieces = client.fetch(request).await.unwrap().into_inner();
+    let first = tokio::time::timeout(Duration::from_millis(300), pieces.message()).await;
+    assert!(first.is_err(), "there is no room: {first:?}");
+    let whole = async {
+        let mut byte_count = 0;
+        while let Some(chunk) = pieces.message().await.unwrap() {
+            byte_count += chunk.data.len();
+        }
+        byte_count
+    };
+    let byte_count = tokio::time::timeout(Duration::from_secs(40), whole).await.unwrap();
+    assert!(byte_count > 4 << 20, "{byte_count}");
+    let mut cut = 0;
+    for mut stream in streams {
+        let end = async {
+            while stream.message().await?.is_some() {}
+            Ok::<(), tonic::Status>(())
+        };
+        cut +=
+            u32::from(tokio::time::timeout(Duration::from_secs(40), end).await.unwrap().is_err());
+    }
+    assert!(cut > 0, "the connection is closed");
 }
 
 /// Begins to submit and goes on no further than the order.
@@ -445,39 +500,43 @@ async fn begin_to_submit(farm: &Farm, version: &str) -> tokio::task::JoinHandle<
 async fn a_client_of_another_version_is_refused_before_it_sends_its_scene() {
     let farm = Farm::new().await;
     let refused = begin_to_submit(&farm, "1.2.4").await;
-    let refused = tokio::time::timeout(Duration::from_secs(10), refused).await;
+    let refused = tokio::time::timeout(Duration::from_secs(40), refused).await;
     assert_eq!(refused.expect("an answer before the end").unwrap(), Code::FailedPrecondition);
 }
 
 #[tokio::test]
 async fn an_upload_that_stands_still_is_dropped() {
-    let farm = Farm::new().await;
+    let farm = Farm::with(OrderLimits::default(), Duration::from_millis(600)).await;
     let dropped = begin_to_submit(&farm, VERSION).await;
-    let dropped = tokio::time::timeout(Duration::from_secs(10), dropped).await;
+    let dropped = tokio::time::timeout(Duration::from_secs(40), dropped).await;
     assert_eq!(dropped.expect("it is dropped").unwrap(), Code::DeadlineExceeded);
 }
 
 #[tokio::test]
 async fn what_is_being_sent_has_so_many_bytes_of_all_clients_together() {
-    let farm = Farm::with(OrderLimits { upload_bytes: 3000, ..OrderLimits::default() }).await;
-    let (send, receive) = tokio::sync::mpsc::channel(4);
+    let orders = OrderLimits { upload_bytes: 3000, ..OrderLimits::default() };
+    let farm = Farm::with(orders, Duration::from_secs(60)).await;
     let part = |part| wire::SubmitRequest { part: Some(part) };
     let long = || part(Part::Text(vec![b' '; 2000].into()));
-    send.send(part(Part::Order(order(VERSION)))).await.unwrap();
-    send.send(long()).await.unwrap();
-    let mut jobs = farm.jobs.clone();
-    let first = tokio_stream::wrappers::ReceiverStream::new(receive);
-    let first = tokio::spawn(async move { jobs.submit(first).await });
-
-    // The first is not at its end, and there is no room for a second as long.
+    let begin = async || {
+        let (send, receive) = tokio::sync::mpsc::channel(4);
+        send.send(part(Part::Order(order(VERSION)))).await.unwrap();
+        send.send(long()).await.unwrap();
+        let mut jobs = farm.jobs.clone();
+        let stream = tokio_stream::wrappers::ReceiverStream::new(receive);
+        (send, tokio::spawn(async move { jobs.submit(stream).await }))
+    };
     let mut jobs = farm.jobs.clone();
     let mut second = async || {
         let parts = [part(Part::Order(order(VERSION))), long(), part(Part::Text(SCENE.into()))];
         jobs.submit(tokio_stream::iter(parts)).await
     };
+    // The first is not at its end, and there is no room for a second as long.
+    let (mut send, mut first) = begin().await;
     loop {
         match second().await {
-            // It was earlier than the other.
+            // It was earlier than the other, for which there may have been no room meanwhile.
+            Ok(_) if first.is_finished() => (send, first) = begin().await,
             Ok(_) => tokio::task::yield_now().await,
             Err(status) => {
                 assert_eq!(status.code(), Code::ResourceExhausted);

@@ -6,7 +6,7 @@
 # PROGRAM is rtfarm, STATE the folder of the farm's state, both on a disk that the nodes share; OPTIONS
 # are those of `rtfarm coordinator`. STATE/access has the access files for worker.sh and for `rtfarm
 # submit`. Queued again, it goes on with its jobs; where that is on another node the access files have
-# its new address, and workers are to be started anew.
+# its new address, where workers and those who submit find it within their --patience.
 #SBATCH --job-name=rtfarm-coordinator
 #SBATCH --cpus-per-task=1
 #SBATCH --signal=B:TERM@30

@@ -1,6 +1,6 @@
 //! How far a job is.
 
-use std::time::Duration;
+use std::{collections::BTreeSet, sync::Arc, time::Duration};
 
 use rtfarm_core::render::Tally;
 
@@ -17,6 +17,9 @@ pub struct Progress {
     pub tally: Tally,
     /// Workers that brought some of them; none where the process renders by itself.
     pub worker_count: u32,
+    /// The hosts that they run on, of those that came since the coordinator's start or finished the
+    /// picture.
+    pub hosts: Arc<BTreeSet<String>>,
     /// Tiles of which two copies differed.
     pub differing_tiles: u32,
     /// Tiles that were taken out of the picture again, since their worker was found to lie.

@@ -2,16 +2,18 @@
 //! token that says what the caller may do. An access file has all three.
 
 use std::{
-    fmt,
+    fmt, fs,
+    path::PathBuf,
     sync::Arc,
     task::{Context, Poll},
 };
 
+use hyper_util::client::legacy::connect::HttpConnector;
 use tonic::{
     body::Body,
     codegen::{
         Service,
-        http::{self, HeaderValue, header::AUTHORIZATION},
+        http::{self, HeaderValue, Uri, header::AUTHORIZATION},
     },
     transport::{Certificate, Channel, ClientTlsConfig},
 };
@@ -30,6 +32,8 @@ const HEAD: &str = "rtfarm access 1";
 pub struct Access {
     address: Address,
     secret: Option<Arc<Secret>>,
+    /// The access file, which is looked into again for each connection.
+    file: Option<PathBuf>,
 }
 
 #[derive(PartialEq, Eq)]
@@ -57,7 +61,7 @@ pub enum ConnectError {
 
 impl From<Address> for Access {
     fn from(address: Address) -> Self {
-        Self { address, secret: None }
+        Self { address, secret: None, file: None }
     }
 }
 
@@ -70,7 +74,7 @@ impl fmt::Debug for Access {
 impl Access {
     /// With this certificate of an authority, as PEM, and this token.
     pub fn new(address: Address, authority: String, token: String) -> Self {
-        Self { address, secret: Some(Arc::new(Secret { authority, token })) }
+        Self { address, secret: Some(Arc::new(Secret { authority, token })), file: None }
     }
 
     /// Reads an access file.
@@ -103,6 +107,13 @@ impl Access {
         Self { address, ..self }
     }
 
+    /// The same, and wherever this access file says that the coordinator is when a connection is made: it
+    /// may come back elsewhere.
+    #[must_use]
+    pub fn kept_in(self, file: PathBuf) -> Self {
+        Self { file: Some(file), ..self }
+    }
+
     /// Where the coordinator is.
     pub fn address(&self) -> &Address {
         &self.address
@@ -132,7 +143,49 @@ impl Access {
             token.set_sensitive(true);
             token
         });
-        Ok(Reached { channel: endpoint.connect().await?, token })
+        let channel = match self.file.clone() {
+            Some(file) => endpoint.connect_with_connector(Dialer::new(file)).await?,
+            None => endpoint.connect().await?,
+        };
+        Ok(Reached { channel, token })
+    }
+}
+
+/// Calls where an access file says that the coordinator is.
+#[derive(Clone)]
+struct Dialer {
+    http: HttpConnector,
+    file: PathBuf,
+}
+
+impl Dialer {
+    fn new(file: PathBuf) -> Self {
+        let mut http = HttpConnector::new();
+        // TLS is spoken above it.
+        http.enforce_http(false);
+        http.set_nodelay(true);
+        Self { http, file }
+    }
+
+    /// The address in the file, if it is one.
+    fn address(&self) -> Option<Uri> {
+        let access = Access::read(&fs::read_to_string(&self.file).ok()?).ok()?;
+        Some(access.address.endpoint().ok()?.uri().clone())
+    }
+}
+
+impl Service<Uri> for Dialer {
+    type Response = <HttpConnector as Service<Uri>>::Response;
+    type Error = <HttpConnector as Service<Uri>>::Error;
+    type Future = <HttpConnector as Service<Uri>>::Future;
+
+    fn poll_ready(&mut self, context: &mut Context<'_>) -> Poll<Result<(), Self::Error>> {
+        self.http.poll_ready(context)
+    }
+
+    fn call(&mut self, address: Uri) -> Self::Future {
+        let address = self.address().unwrap_or(address);
+        self.http.call(address)
     }
 }
 

@@ -51,6 +51,39 @@ fn frames_are_those_of_single_renders_and_the_next_fills_the_tail_of_the_last() 
 }
 
 #[test]
+fn frames_that_are_there_are_passed_over_and_others_are_rendered() {
+    use std::os::unix::fs::MetadataExt;
+    let place = place_with_shots();
+    let files = || -> Vec<u64> {
+        let names = (1..=3).map(|frame| place.path(&format!("out.{frame}.png")));
+        names.map(|path| fs::metadata(path).unwrap().ino()).collect()
+    };
+    let frames = ["render", "shot.%03d.rt", "-o", "out.%d.png", "--frames", "1-3", "--resume"];
+    let render = |more: &[&str]| {
+        let common = ["--size", "64x48", "--samples", "2", "--workers", "0"];
+        let mut render = place.start("log", &[&frames[..], &common, more].concat());
+        assert!(render.wait().success(), "{}", render.log());
+        render.log().matches("is there already").count()
+    };
+    assert_eq!(render(&[]), 0);
+    let first = files();
+    assert_eq!((render(&[]), files()), (3, first.clone()));
+    // Another scene, a picture that is not whole, a file beside it that is wanted, other settings.
+    fs::write(place.path("shot.002.rt"), scene_text()).unwrap();
+    let whole = fs::read(place.path("out.3.png")).unwrap();
+    fs::write(place.path("out.3.png"), &whole[..40]).unwrap();
+    assert_eq!(render(&[]), 1);
+    let second = files();
+    assert_eq!(second[0], first[0]);
+    assert!(second[1] != first[1] && fs::read(place.path("out.3.png")).unwrap() == whole);
+    assert_eq!(
+        (render(&["--sidecar"]), render(&["--sidecar"]), render(&["--seed", "1"])),
+        (0, 3, 0)
+    );
+    place.check_nothing_is_left();
+}
+
+#[test]
 fn frames_that_cannot_all_be_rendered_are_told_before_any_is() {
     let place = place_with_shots();
     for (scene, output, frames, code, reason) in [

@@ -87,7 +87,7 @@ fn a_worker_that_lies_is_kept_out_also_by_the_next_coordinator_and_leaves_no_pix
     let picture = ["--size", "96x64", "--tile", "8", "--samples", "64"];
     let here = place.render("here.png", &[&picture[..], &["--workers", "0"]].concat());
     let args = ["coordinator", "--insecure", "--state", "state", "--listen"];
-    let mut coordinator = place.start("first.log", &[&args[..], &["127.0.0.1:0"]].concat());
+    let mut coordinator = place.start("first.log", &[&args[..], &[&own_address()]].concat());
     let line = coordinator.read_line();
     let url = line.trim().strip_prefix("listening on ").expect(&line).to_owned();
     let runtime = tokio::runtime::Runtime::new().unwrap();

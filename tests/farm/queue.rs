@@ -18,7 +18,7 @@ fn start_farm_with(place: &Place, listen: &str, more: &[&str]) -> (Process, Stri
         "--state",
         "state",
         "--lease-seconds",
-        "0.5",
+        "2",
     ];
     let mut coordinator = place.start("coordinator.log", &[&args[..], more].concat());
     let line = coordinator.read_line();
@@ -72,7 +72,7 @@ fn order(place: &Place, url: &str) -> Vec<String> {
 #[test]
 fn people_can_live_with_the_queue() {
     let place = Place::new();
-    let (mut coordinator, mut url) = start_farm(&place, "127.0.0.1:0");
+    let (mut coordinator, mut url) = start_farm(&place, &own_address());
 
     // Two jobs that nobody renders yet, one of them ordered twice under a key.
     let named = ["--name", "my picture", "--owner", "anna", "--max-workers", "2"];
@@ -96,7 +96,9 @@ fn people_can_live_with_the_queue() {
     let impatient = ["watch", &second, "--patience", "0.1", "--coordinator", &url];
     let mut impatient = place.start("impatient.log", &impatient);
     // Both hear of the job before its coordinator goes.
-    thread::sleep(Duration::from_millis(300));
+    for watch in [&watch, &impatient] {
+        poll(|| watch.log().contains("the farm has no worker").then_some(()));
+    }
 
     // All of it outlives the coordinator.
     coordinator.signal(Signal::KILL);
@@ -156,9 +158,10 @@ fn people_can_live_with_the_queue() {
     assert_eq!(json(&place, &url, &["watch", &third])["state"], "finished");
     let here = place.render("here.png", &[&small[..], &["--workers", "0"]].concat());
     json(&place, &url, &["image", &third, "-o", "kept.png", "--keep"]);
-    json(&place, &url, &["image", &third, "-o", "out.png"]);
+    json(&place, &url, &["image", &third, "-o", "out.png", "--sidecar"]);
     assert!(fs::read(place.path("out.png")).unwrap() == here);
     assert!(fs::read(place.path("kept.png")).unwrap() == here);
+    verify::check_sidecar(&place, "out.png", 1);
     assert!(order(&place, &url).is_empty(), "it was fetched");
     worker.signal(Signal::TERM);
     worker.wait();
@@ -188,7 +191,7 @@ fn a_tile_that_ends_three_workers_is_set_aside_the_others_finished_and_it_is_tri
     let place = Place::new();
     // Workers that compare its other tile would die of that one.
     let no_audit = ["--audit", "0"];
-    let (mut coordinator, mut url) = start_farm_with(&place, "127.0.0.1:0", &no_audit);
+    let (mut coordinator, mut url) = start_farm_with(&place, &own_address(), &no_audit);
     let start = || place.start("worker.log", &["worker", "--threads", "1", "--coordinator", &url]);
     let two_tiles = ["--size", "96x48", "--tile", "48", "--samples", "1024"];
     let job = detach(&place, &url, &two_tiles);
@@ -220,7 +223,7 @@ fn a_tile_that_ends_three_workers_is_set_aside_the_others_finished_and_it_is_tri
 fn what_became_of_a_tile_is_explained_and_what_happened_is_told_in_lines_of_json() {
     let place = Place::new();
     let (mut coordinator, url) =
-        start_farm_with(&place, "127.0.0.1:0", &["--events", "events.jsonl", "--audit", "0"]);
+        start_farm_with(&place, &own_address(), &["--events", "events.jsonl", "--audit", "0"]);
     let job = detach(&place, &url, &["--size", "64x48", "--samples", "4096", "--tile", "16"]);
     // Nobody is there, and who waits is told.
     let entry = entry(&place, &url, &job);
@@ -246,7 +249,7 @@ fn what_became_of_a_tile_is_explained_and_what_happened_is_told_in_lines_of_json
     let tile = lost["tile"].to_string();
     poll(|| {
         let told = json(&place, &url, &["explain", &job, &tile]);
-        (told["attempts"][0]["lost"] == "no progress for 0.5 s" || told["state"] == "done")
+        (told["attempts"][0]["lost"] == "no progress for 2.0 s" || told["state"] == "done")
             .then_some(())
     });
     let _second = place.start("second.log", &worker);

@@ -15,7 +15,7 @@ use super::*;
 /// A farm with certificates and tokens, started; and its address.
 fn start_farm(place: &Place) -> (Process, String) {
     let args = ["coordinator", "--listen", "127.0.0.1:0", "--state", "farm"];
-    let limits = ["--strangers", "4", "--greeting-seconds", "1", "--handshake-seconds", "1"];
+    let limits = ["--strangers", "4", "--greeting-seconds", "3", "--handshake-seconds", "3"];
     let mut coordinator = place.start("coordinator.log", &[&args[..], &limits].concat());
     let line = coordinator.read_line();
     let url = line.trim().strip_prefix("listening on ").expect(&line).to_owned();
@@ -159,11 +159,7 @@ fn who_has_no_token_or_that_of_another_role_or_farm_is_refused_and_told_why() {
         (vec!["jobs"], 2, "--access FILE"),
         (vec!["jobs", "--coordinator", &url], 1, "needs an access file"),
         ([&order[..], &[&of("read")]].concat(), 1, "the token is one to read"),
-        (
-            vec!["worker", "--access", &of("submit"), "--patience", "1"],
-            1,
-            "the token is one to submit",
-        ),
+        (vec!["worker", "--access", &of("submit")], 1, "the token is one to submit"),
         // Another farm's coordinator, and one that shows no certificate.
         (
             vec!["jobs", "--access", "foreign", "--coordinator", &url],
@@ -196,6 +192,34 @@ fn who_has_no_token_or_that_of_another_role_or_farm_is_refused_and_told_why() {
         1,
         "there are no tokens in",
     );
+}
+
+#[test]
+fn a_coordinator_that_comes_back_elsewhere_is_found_again_by_those_who_have_its_access_files() {
+    let place = Place::new();
+    let start = |log: &str| {
+        let listen = own_address();
+        let args = ["coordinator", "--listen", &listen, "--state", "farm"];
+        let mut coordinator = place.start(log, &args);
+        assert!(coordinator.read_line().ends_with(&format!("{listen}\n")));
+        coordinator
+    };
+    let mut first = start("first.log");
+    let worker = ["worker", "--threads", "1", "--access", "farm/access/work"];
+    let mut worker = place.start("worker.log", &worker);
+    let submit = ["submit", "scene.rt", "-o", "out.png", "--access", "farm/access/submit"];
+    let mut submit = place.start("submit.log", &[&submit[..], &SLOW].concat());
+    poll(|| (first.tiles_done() >= 10).then_some(()));
+    first.signal(Signal::KILL);
+    first.wait();
+    let mut second = start("second.log");
+    assert!(submit.wait().success(), "{}", submit.log());
+    assert!(second.tiles_done() > 0);
+    second.signal(Signal::TERM);
+    assert_eq!(second.wait().code(), Some(0), "{}", second.log());
+    assert!(worker.wait().success(), "sent home: {}", worker.log());
+    let here = place.render("here.png", &[&SLOW[..], &["--workers", "0"]].concat());
+    assert!(fs::read(place.path("out.png")).unwrap() == here);
 }
 
 #[test]

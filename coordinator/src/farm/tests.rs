@@ -212,7 +212,7 @@ fn a_tile_counts_and_is_acknowledged_when_it_is_stored() {
     assert_eq!(verdicts(&actions), [(id, Verdict::Accepted)]);
     let progress = shown(&actions);
     assert_eq!((progress.tiles_done, progress.worker_count, progress.tally.rays), (1, 1, 10));
-    assert_eq!(progress.outcome, None);
+    assert_eq!((progress.outcome, progress.hosts.len()), (None, 1));
 }
 
 #[test]
