@@ -297,10 +297,10 @@ fn paths_are_read_with_their_braces() {
 }
 
 /// The coordinator's files, each of which knows earlier ones only.
-const COORDINATOR: [&str; 23] = [
-    "upload", "identity", "tiles", "pace", "lease", "members", "waiting", "audit", "farm", "store",
-    "record", "state", "job", "events", "shell", "live", "metrics", "accept", "security", "guard",
-    "page", "service", "run",
+const COORDINATOR: [&str; 24] = [
+    "upload", "flight", "identity", "tiles", "pace", "lease", "members", "waiting", "audit",
+    "farm", "store", "record", "state", "job", "events", "shell", "live", "metrics", "accept",
+    "security", "guard", "page", "service", "run",
 ];
 
 #[test]
