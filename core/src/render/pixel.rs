@@ -220,7 +220,7 @@ impl Pixel {
     /// the first round. The own samples are left out: where they decide when to stop, those whose
     /// samples agree by chance stop, and that is a bias of their mean, as it hangs together with
     /// their variance, and of the error they tell.
-    pub(super) fn set_noise<'a>(&mut self, around: impl Iterator<Item = &'a Self> + Clone) {
+    pub(super) fn set_noise<'a>(&mut self, around: &(impl Iterator<Item = &'a Self> + Clone)) {
         let count = around.clone().count();
         if count < 2 || around.clone().any(|pixel| pixel.count() < FEWEST_FOR_ERROR) {
             return;
@@ -436,7 +436,7 @@ mod tests {
         let decide = |own: &[f64], others: [&[f64]; 8], more: usize| {
             let mut own = pixel(0.5, own.iter().copied());
             let others = others.map(|others| pixel(0.5, others.iter().copied()));
-            own.set_noise(others.iter().chain([&own.clone()]));
+            own.set_noise(&others.iter().chain([&own.clone()]));
             (0..more).for_each(|_| own.add(DVec3::splat(0.5)));
             own.is_done(&wanted(0.03))
         };
@@ -450,7 +450,7 @@ mod tests {
         assert!(decide(&lucky, mixed, 0) && !decide(&noisy, [&calm; 8], 0));
         // Nor does it where later samples see what no neighbour did.
         let mut surprised = pixel(0.5, [0.5; 7]);
-        surprised.set_noise([pixel(0.5, [0.5; 7]); 9].iter());
+        surprised.set_noise(&[pixel(0.5, [0.5; 7]); 9].iter());
         assert!(surprised.is_done(&wanted(0.03)));
         (0..8).for_each(|k| surprised.add(DVec3::splat(f64::from(k % 2))));
         assert!(!surprised.is_done(&wanted(0.03)));

@@ -138,7 +138,7 @@ impl<'a> Sampler<'a> {
             let mut pixel = pixels[far.index_of(x, y) as usize];
             let around = neighbours(far, x, y).map(|index| &pixels[index as usize]);
             pixel.set_contrast(around.clone().map(Pixel::range));
-            pixel.set_noise(around);
+            pixel.set_noise(&around);
             let unseen = found.next_if(|&(at, _)| at == index).map(|(_, unseen)| unseen);
             let mut pixel = OpenPixel { index, pixel, unseen };
             pixel.note_samples(search.as_ref(), area, seed, 1);
