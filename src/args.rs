@@ -196,7 +196,7 @@ pub(crate) struct VerifyArgs {
     threads: Option<u16>,
 
     /// The instruction set that the kernels use; all give the same bytes.
-    #[arg(long, value_name = "auto|scalar|sse2|avx2", default_value = "auto", help_heading = WORK)]
+    #[arg(long, value_name = "auto|scalar|sse2|avx2|avx512", default_value = "auto", help_heading = WORK)]
     pub(crate) isa: IsaChoice,
 
     /// Answer in JSON.
@@ -404,7 +404,7 @@ pub(crate) struct RenderArgs {
     threads: Option<u16>,
 
     /// The instruction set that the kernels use; all give the same bytes.
-    #[arg(long, value_name = "auto|scalar|sse2|avx2", default_value = "auto", help_heading = WORK)]
+    #[arg(long, value_name = "auto|scalar|sse2|avx2|avx512", default_value = "auto", help_heading = WORK)]
     pub(crate) isa: IsaChoice,
 
     /// A worker that makes no progress for this long loses its tiles to others.
@@ -521,7 +521,7 @@ pub(crate) struct WorkerArgs {
     threads: Option<u16>,
 
     /// The instruction set that the kernels use; all give the same bytes.
-    #[arg(long, value_name = "auto|scalar|sse2|avx2", default_value = "auto", env = "RTFARM_ISA", help_heading = WORK)]
+    #[arg(long, value_name = "auto|scalar|sse2|avx2|avx512", default_value = "auto", env = "RTFARM_ISA", help_heading = WORK)]
     pub(crate) isa: IsaChoice,
 
     /// Memory in GB for prepared scenes; a scene that needs more is left to others.

@@ -12,6 +12,7 @@ mod image;
 mod local;
 mod log_queue;
 mod manual;
+mod memory;
 mod output;
 mod pilot;
 mod private_folder;
@@ -48,6 +49,7 @@ const VERSION: &str = env!("CARGO_PKG_VERSION");
 const BUILD: &str = env!("RTFARM_BUILD");
 
 fn main() -> ExitCode {
+    memory::return_what_is_freed();
     let args = match Args::try_parse() {
         Ok(args) => args,
         Err(error) => return failure::explain_usage(&error),

@@ -11,11 +11,13 @@ pub enum Isa {
     Sse2,
     /// x86-64 with AVX2, eight lanes.
     Avx2,
+    /// x86-64 with AVX-512 (F and VL), a triangle on eight rays at once.
+    Avx512,
 }
 
 impl Isa {
     /// Every instruction set, slowest first.
-    pub const ALL: [Self; 3] = [Self::Scalar, Self::Sse2, Self::Avx2];
+    pub const ALL: [Self; 4] = [Self::Scalar, Self::Sse2, Self::Avx2, Self::Avx512];
 
     /// The fastest that this machine runs.
     pub fn fastest() -> Self {
@@ -30,8 +32,13 @@ impl Isa {
             Self::Sse2 => true,
             #[cfg(target_arch = "x86_64")]
             Self::Avx2 => std::arch::is_x86_feature_detected!("avx2"),
+            #[cfg(target_arch = "x86_64")]
+            Self::Avx512 => {
+                std::arch::is_x86_feature_detected!("avx512f")
+                    && std::arch::is_x86_feature_detected!("avx512vl")
+            }
             #[cfg(not(target_arch = "x86_64"))]
-            Self::Sse2 | Self::Avx2 => false,
+            Self::Sse2 | Self::Avx2 | Self::Avx512 => false,
         }
     }
 }
@@ -42,6 +49,7 @@ impl fmt::Display for Isa {
             Self::Scalar => "scalar",
             Self::Sse2 => "sse2",
             Self::Avx2 => "avx2",
+            Self::Avx512 => "avx512",
         })
     }
 }
@@ -60,7 +68,7 @@ fn supported() -> String {
 impl FromStr for Isa {
     type Err = IsaError;
 
-    /// Reads `scalar`, `sse2` or `avx2`; one that this machine cannot run is an error.
+    /// Reads `scalar`, `sse2`, `avx2` or `avx512`; one that this machine cannot run is an error.
     fn from_str(name: &str) -> Result<Self, IsaError> {
         Self::ALL
             .into_iter()

@@ -1,4 +1,4 @@
-//! Hashes of numbers for tables of indices. What is kept does not depend on them.
+//! Hashes of numbers for tables of indices, of which nothing that is kept depends, and of content.
 
 use std::hash::{BuildHasher, Hasher, RandomState};
 
@@ -37,4 +37,9 @@ impl HashFunction {
         }
         hasher.finish()
     }
+}
+
+/// The BLAKE3 hash of some bytes, which names their content; on rayon's threads where it is long.
+pub(crate) fn content_hash(bytes: &[u8]) -> blake3::Hash {
+    blake3::Hasher::new().update_rayon(bytes).finalize()
 }

@@ -16,6 +16,7 @@ use super::{
 };
 use crate::{
     assets::{mesh, texture},
+    exact::hash::content_hash,
     scene::Scene,
 };
 
@@ -166,7 +167,7 @@ impl<'a, 't, T: Clone> Files<'a, 't, T> {
         decode: impl FnOnce(&str, &[u8]) -> Result<T, String>,
     ) -> Result<T, String> {
         let bytes = (self.resolve)(path).map_err(|error| error.to_string())?;
-        let hash = blake3::hash(&bytes);
+        let hash = content_hash(&bytes);
         if let Some(known) = self.by_content.get(&hash) {
             return Ok(known.clone());
         }

@@ -1,5 +1,7 @@
 //! The first step: all faces of a scene, in the scene's own units.
 
+use rayon::prelude::*;
+
 use super::{
     flat::{FaceAttributes, FlatFaces},
     place::place_mesh,
@@ -41,11 +43,11 @@ impl Collected {
             let first_point = flat.points.len() as u32;
             flat.points.extend(place_mesh(mesh));
             let first = ranks.first(mesh.primitive);
-            for (face, triangle) in (0..).zip(&mesh.shape.triangles) {
-                flat.corners.extend(triangle.map(|corner| first_point + corner));
-                let rank = first + face;
-                flat.attributes.push(FaceAttributes { material: mesh.material, rank });
-            }
+            let corners = mesh.shape.triangles.as_flattened();
+            flat.corners.par_extend(corners.par_iter().map(|&corner| first_point + corner));
+            let ranks = first..first + mesh.shape.triangles.len() as u32;
+            let attributes = |rank| FaceAttributes { material: mesh.material, rank };
+            flat.attributes.par_extend(ranks.into_par_iter().map(attributes));
         }
         for face in &scene.quadrangles {
             flat.push_points(&face.vertices);

@@ -1,12 +1,13 @@
 //! Point lights, with the surfaces that they lie on.
 
 use glam::DVec3;
+use rayon::prelude::*;
 
 use super::{error::PrepareError, flat::bounds_of, sort::Sorted};
 use crate::{
     prepared::{
         face::triangle_normal,
-        record::{LightRecord, Surface},
+        record::{LightRecord, PlaneIndex, Surface},
     },
     scene::Light,
 };
@@ -39,8 +40,7 @@ impl Lights {
 
 /// The surfaces that a point lies on, within rounding.
 fn surfaces_at(point: DVec3, faces: &Sorted) -> Vec<Surface> {
-    let mut surfaces = Vec::new();
-    let mut add_flat = |corners: &[u32], normal: &dyn Fn() -> DVec3, surface: Surface| {
+    let flat_at = |corners: &[u32], normal: &dyn Fn() -> DVec3, surface: Surface| {
         let mut points = [DVec3::ZERO; 4];
         for (point, &corner) in points.iter_mut().zip(corners) {
             *point = DVec3::from_array(faces.vertices[corner as usize]);
@@ -48,23 +48,23 @@ fn surfaces_at(point: DVec3, faces: &Sorted) -> Vec<Surface> {
         let (min, max) = bounds_of(&points[..corners.len()]);
         let blur = 8.0 * f64::EPSILON * (max.abs().max(min.abs()).max(point.abs()));
         let is_within = point.cmpge(min - blur).all() && point.cmple(max + blur).all();
-        if is_within && normal().dot(point - points[0]).abs() <= blur.max_element() {
-            surfaces.push(surface);
-        }
+        let is_on = is_within && normal().dot(point - points[0]).abs() <= blur.max_element();
+        is_on.then_some(surface)
     };
-    for triangle in &faces.triangles {
+    let in_plane = |corners: &[u32], plane: PlaneIndex| {
+        let normal = || DVec3::from_array(faces.planes[plane.index()].normal);
+        flat_at(corners, &normal, plane.surface())
+    };
+    let triangles = faces.triangles.par_iter().filter_map(|triangle| {
         let corner = |v: u32| DVec3::from_array(faces.vertices[v as usize]);
         let normal = || triangle_normal(triangle.vertices.map(corner));
-        add_flat(&triangle.vertices, &normal, Surface(triangle.rank));
-    }
-    for face in &faces.coplanars {
-        let normal = || DVec3::from_array(faces.planes[face.plane.index()].normal);
-        add_flat(&face.vertices, &normal, face.plane.surface());
-    }
-    for face in &faces.quadrangles {
-        let normal = || DVec3::from_array(faces.planes[face.plane.index()].normal);
-        add_flat(&face.vertices, &normal, face.plane.surface());
-    }
+        flat_at(&triangle.vertices, &normal, Surface(triangle.rank))
+    });
+    let mut surfaces: Vec<Surface> = triangles.collect();
+    let coplanars = faces.coplanars.par_iter();
+    surfaces.par_extend(coplanars.filter_map(|face| in_plane(&face.vertices, face.plane)));
+    let quadrangles = faces.quadrangles.par_iter();
+    surfaces.par_extend(quadrangles.filter_map(|face| in_plane(&face.vertices, face.plane)));
     let is_on_sphere = |center: [f64; 3], radius: f64| {
         let blur = 8.0 * f64::EPSILON * (radius + point.abs().max_element());
         ((point - DVec3::from_array(center)).length() - radius).abs() <= blur

@@ -1,6 +1,7 @@
 //! Meshes where the scene wants them.
 
 use glam::DVec3;
+use rayon::prelude::*;
 
 use crate::{
     exact::float::power_of_two_below_inverse,
@@ -25,10 +26,10 @@ pub(super) fn place_mesh(mesh: &Mesh) -> Vec<DVec3> {
     };
     match &mesh.shape.vertices {
         MeshVertices::Single(vertices) => {
-            vertices.iter().map(|v| place(DVec3::from_array(v.map(f64::from)))).collect()
+            vertices.par_iter().map(|v| place(DVec3::from_array(v.map(f64::from)))).collect()
         }
         MeshVertices::Double(vertices) => {
-            vertices.iter().map(|&v| place(DVec3::from_array(v))).collect()
+            vertices.par_iter().map(|&v| place(DVec3::from_array(v))).collect()
         }
     }
 }

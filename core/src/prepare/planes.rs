@@ -65,7 +65,7 @@ impl Sharing<'_> {
             }
         });
         let mut by_plane: Vec<(u64, u32, u32)> = fingerprints
-            .into_iter()
+            .into_par_iter()
             .enumerate()
             .filter(|&(face, _)| match *flat.corners_of(face) {
                 [a, b, c, d] => is_coplanar(a, b, c, d),
@@ -74,11 +74,20 @@ impl Sharing<'_> {
             .filter_map(|(face, print)| Some((print?, flat.rank(face), face as u32)))
             .collect();
         by_plane.par_sort_unstable();
-        for group in by_plane.chunk_by(|a, b| a.0 == b.0) {
-            let first = group[0].2 as usize;
-            if group.len() > 1 || first >= flat.triangle_count {
-                self.share(group.iter().map(|&(_, _, face)| face as usize));
-            }
+        let groups: Vec<&[(u64, u32, u32)]> = by_plane
+            .chunk_by(|a, b| a.0 == b.0)
+            .filter(|group| group.len() > 1 || group[0].2 as usize >= flat.triangle_count)
+            .collect();
+        self.planes = groups.par_iter().map(|group| plane_of(flat, group[0].2 as usize)).collect();
+        let of_faces: Vec<(u32, PlaneIndex)> = (groups.par_iter().zip(&self.planes).enumerate())
+            .flat_map_iter(|(index, (group, plane))| {
+                group
+                    .iter()
+                    .map(move |&(_, _, face)| (face, index_for(flat, face as usize, index, plane)))
+            })
+            .collect();
+        for (face, index) in of_faces {
+            self.of_faces[face as usize] = Some(index);
         }
     }
 
@@ -132,11 +141,16 @@ impl Sharing<'_> {
         let plane = plane_of(self.flat, *group.peek().expect("a group has a face"));
         let index = self.planes.len();
         for face in group {
-            let is_reversed = self.flat.normal(face).dot(DVec3::from_array(plane.normal)) < 0.0;
-            self.of_faces[face] = Some(PlaneIndex::new(index, is_reversed));
+            self.of_faces[face] = Some(index_for(self.flat, face, index, &plane));
         }
         self.planes.push(plane);
     }
+}
+
+/// The index of a plane for a face in it, which looks to one of its sides.
+fn index_for(flat: &FlatFaces, face: usize, index: usize, plane: &PlaneRecord) -> PlaneIndex {
+    let is_reversed = flat.normal(face).dot(DVec3::from_array(plane.normal)) < 0.0;
+    PlaneIndex::new(index, is_reversed)
 }
 
 /// The plane with Newell's normal through a triangle's first corner, which is in it exactly, or

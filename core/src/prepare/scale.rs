@@ -1,6 +1,7 @@
 //! The second step: coordinates times a power of two.
 
 use glam::DVec3;
+use rayon::prelude::*;
 
 use super::{collect::Collected, flat::FlatFaces, solid_trees::SolidTrees};
 use crate::{
@@ -24,7 +25,7 @@ impl Collected {
     pub(super) fn scale(self, other_extent: f64) -> Scaled {
         let scale = power_of_two_below_inverse(self.extent().max(other_extent));
         let Self { mut flat, mut spheres, mut solids } = self;
-        flat.points.iter_mut().for_each(|point| *point *= scale);
+        flat.points.par_iter_mut().for_each(|point| *point *= scale);
         for sphere in &mut spheres {
             sphere.center = sphere.center.map(|x| x * scale);
             sphere.radius *= scale;
@@ -43,13 +44,11 @@ impl Collected {
     fn extent(&self) -> f64 {
         let of_sphere = |center: DVec3, radius: f64| center.abs().max_element().max(radius);
         let of_corner = |&corner: &u32| self.flat.points[corner as usize].abs().max_element();
-        (self.flat.corners.iter().map(of_corner))
-            .chain(
-                (self.spheres.iter())
-                    .map(|sphere| of_sphere(DVec3::from_array(sphere.center), sphere.radius)),
-            )
+        let of_corners = self.flat.corners.par_iter().map(of_corner).reduce(|| 0.0, f64::max);
+        (self.spheres.iter())
+            .map(|sphere| of_sphere(DVec3::from_array(sphere.center), sphere.radius))
             .chain(self.solids.leaves.iter().map(|leaf| of_sphere(leaf.center, leaf.radius)))
-            .fold(0.0, f64::max)
+            .fold(of_corners, f64::max)
     }
 }
 

@@ -22,7 +22,7 @@ impl Scaled {
     pub(super) fn weld(self) -> Welded {
         let Self { mut flat, spheres, solids, .. } = self;
         let firsts = find_firsts(&flat.points);
-        flat.corners.iter_mut().for_each(|corner| *corner = firsts[*corner as usize]);
+        flat.corners.par_iter_mut().for_each(|corner| *corner = firsts[*corner as usize]);
         Welded { flat, spheres, solids }
     }
 }

@@ -8,7 +8,10 @@ use std::ops::ControlFlow;
 use super::{
     box_ray::BoxRay,
     boxes::{BoxKernel, KernelWork},
-    hit::{Nearest, between, is_between, take_crossing},
+    hit::{
+        Nearest, between, is_between, is_quadrangle_between, take_crossing, take_quadrangle,
+        take_sphere,
+    },
     kernels::run_with_kernel,
     lanes::{CLASSES, MOST_RAYS},
     packet::{Meeting, Packet, PacketStack, visit_packet},
@@ -204,6 +207,28 @@ impl<K: BoxKernel> Meeting for NearestOfPacket<'_, K> {
     }
 
     #[inline(always)]
+    fn is_plain(&self, _item: Item) -> bool {
+        true
+    }
+
+    #[inline(always)]
+    fn cross_sphere(&mut self, place: usize, item: Item, ends: [f64; 2]) -> Step {
+        let hit = &mut self.hits[usize::from(self.members[place])];
+        if take_sphere(self.view, item, ends, hit) { Step::On(hit.t) } else { Step::Past }
+    }
+
+    #[inline(always)]
+    fn cross_quadrangle(&mut self, place: usize, item: Item) -> Step {
+        let member = usize::from(self.members[place]);
+        let hit = &mut self.hits[member];
+        if take_quadrangle(self.view, &self.rays[member], item, hit) {
+            Step::On(hit.t)
+        } else {
+            Step::Past
+        }
+    }
+
+    #[inline(always)]
     fn ask(&mut self, place: usize, item: Item, shear: &Shear, box_ray: &BoxRay) -> Step {
         let member = usize::from(self.members[place]);
         let hit = &mut self.hits[member];
@@ -275,6 +300,31 @@ impl<K: BoxKernel> Meeting for BlockedOfPacket<'_, K> {
     fn cross(&mut self, place: usize, item: Item, t: f64) -> Step {
         let member = usize::from(self.members[place]);
         if is_between(self.view, &self.rays[member], self.ending_on, item, t) {
+            self.shares[member] = 0.0;
+            return Step::Enough;
+        }
+        Step::Past
+    }
+
+    #[inline(always)]
+    fn is_plain(&self, item: Item) -> bool {
+        self.ending_on.is_empty() || !self.ending_on.contains(&Face::whole(item).surface(self.view))
+    }
+
+    #[inline(always)]
+    fn cross_sphere(&mut self, place: usize, _item: Item, ends: [f64; 2]) -> Step {
+        let member = usize::from(self.members[place]);
+        if ends.iter().any(|&t| t > 0.0 && t < self.rays[member].reach) {
+            self.shares[member] = 0.0;
+            return Step::Enough;
+        }
+        Step::Past
+    }
+
+    #[inline(always)]
+    fn cross_quadrangle(&mut self, place: usize, item: Item) -> Step {
+        let member = usize::from(self.members[place]);
+        if is_quadrangle_between(self.view, &self.rays[member], item) {
             self.shares[member] = 0.0;
             return Step::Enough;
         }

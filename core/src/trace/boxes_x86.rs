@@ -173,6 +173,7 @@ impl BoxKernel for Avx2Boxes {
         unsafe {
             let halves = [self.numbers_of([a, b, c, d]), self.numbers_of([e, f, g, h])];
             let one = _mm256_set1_pd(1.0);
+            let mut inverses = [[one; 3]; 2];
             for axis in 0..3 {
                 let low = self.turned(halves[0][axis], axis, &turn.frame);
                 let high = self.turned(halves[1][axis], axis, &turn.frame);
@@ -181,8 +182,10 @@ impl BoxKernel for Avx2Boxes {
                 let (near, far) = if forward { (above, below) } else { (below, above) };
                 _mm256_store_ps(group.near_origin[axis].as_mut_ptr(), near);
                 _mm256_store_ps(group.far_origin[axis].as_mut_ptr(), far);
-                let low = _mm256_cvtpd_ps(_mm256_div_pd(one, halves[0][3 + axis]));
-                let high = _mm256_cvtpd_ps(_mm256_div_pd(one, halves[1][3 + axis]));
+                for half in 0..2 {
+                    inverses[half][axis] = _mm256_div_pd(one, halves[half][3 + axis]);
+                }
+                let [low, high] = inverses.map(|half| _mm256_cvtpd_ps(half[axis]));
                 let inverse = _mm256_set_m128(high, low);
                 _mm256_store_ps(group.inverse[axis].as_mut_ptr(), inverse);
                 let far_inverse = _mm256_mul_ps(inverse, _mm256_set1_ps(FAR));
@@ -194,13 +197,18 @@ impl BoxKernel for Avx2Boxes {
                 let store = |lanes: &mut [f64; LANES], numbers| {
                     _mm256_store_pd(lanes.as_mut_ptr().add(4 * half), numbers);
                 };
+                for axis in 0..3 {
+                    store(&mut group.direction[axis], numbers[3 + axis]);
+                }
+                let leaving = group.leaving.as_mut_ptr().add(4 * half);
+                _mm256_store_pd(leaving.cast(), numbers[7]);
                 let depth = numbers[3 + z];
                 store(&mut group.origin[0], numbers[x]);
                 store(&mut group.origin[1], numbers[y]);
                 store(&mut group.origin[2], numbers[z]);
                 store(&mut group.slopes[0], _mm256_div_pd(numbers[3 + x], depth));
                 store(&mut group.slopes[1], _mm256_div_pd(numbers[3 + y], depth));
-                store(&mut group.slopes[2], _mm256_div_pd(one, depth));
+                store(&mut group.slopes[2], inverses[half][z]);
                 let turn = &turn.reach;
                 let from_start = _mm256_sub_pd(numbers[6], _mm256_set1_pd(turn.start));
                 let scaled = _mm256_mul_pd(from_start, _mm256_set1_pd(turn.scale));

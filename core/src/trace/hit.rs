@@ -6,7 +6,7 @@ use super::{
     box_ray::BoxRay,
     boxes::BoxKernel,
     course::Crossing,
-    quadrangle::{hit_plane, hit_quadrangle, is_inside},
+    quadrangle::{hit_chord, hit_plane, is_inside},
     ray::{Hit, Ray, Shear},
     solid::Scratch,
     sphere::{hit_sphere, hit_sphere_again},
@@ -69,6 +69,21 @@ pub(super) fn take_crossing(view: &View<'_>, ray: &Ray, item: Item, t: f64, hit:
     meet_triangle(view, ray, item, t).is_some_and(|met| take(hit, item, met))
 }
 
+/// A ray's line crosses a sphere that the ray does not leave; whether that is its nearest hit until
+/// now.
+#[inline(always)]
+pub(super) fn take_sphere(view: &View<'_>, item: Item, ends: [f64; 2], hit: &mut Hit) -> bool {
+    let t = first_end(ends);
+    t > 0.0 && take(hit, item, (t, view.spheres[item.index()].rank, Part::WHOLE))
+}
+
+/// A ray passes inside a quadrangle, before or behind its start; whether that is its nearest hit until
+/// now.
+#[inline(always)]
+pub(super) fn take_quadrangle(view: &View<'_>, ray: &Ray, item: Item, hit: &mut Hit) -> bool {
+    meet_quadrangle(view, ray, item).is_some_and(|met| take(hit, item, met))
+}
+
 /// The distance at which the ray crosses a face other than the one that it leaves, the face's rank,
 /// and its part; `None` for a solid. The distance is above 0, or 0 for a face that coincides with
 /// one that the ray went through and comes later.
@@ -86,17 +101,11 @@ fn meet(view: &View<'_>, ray: &Ray, shear: &Shear, item: Item) -> Option<(f64, u
         }
         Kind::Quadrangle => {
             let face = &view.quadrangles[index];
-            let is_left = ray.leaving == face.plane.surface();
-            if is_left && face.rank <= ray.after {
+            if ray.leaving == face.plane.surface() && face.rank <= ray.after {
                 return None;
             }
             let corners = shear.project_all(view.corners(&face.vertices));
-            if is_left {
-                return is_inside(&corners).then_some((0.0, face.rank, Part::WHOLE));
-            }
-            let plane = &view.planes[face.plane.index()];
-            let [point, normal] = [plane.point, plane.normal].map(DVec3::from_array);
-            (hit_quadrangle(ray, &corners, point, normal)?, face.rank)
+            return if is_inside(&corners) { meet_quadrangle(view, ray, item) } else { None };
         }
         Kind::Sphere => {
             let sphere = &view.spheres[index];
@@ -107,14 +116,37 @@ fn meet(view: &View<'_>, ray: &Ray, shear: &Shear, item: Item) -> Option<(f64, u
                 }
                 hit_sphere_again(ray, center)
             } else {
-                let [near, far] = hit_sphere(ray, center, sphere.radius)?;
-                if near > 0.0 { near } else { far }
+                first_end(hit_sphere(ray, center, sphere.radius)?)
             };
             (t, sphere.rank)
         }
         Kind::Solid => return None,
     };
     (t > 0.0).then_some((t, rank, Part::WHOLE))
+}
+
+/// Of the two distances at which a line crosses a sphere, the one at which a ray that starts at 0 first
+/// does; not above 0 if both are behind it.
+#[inline(always)]
+fn first_end([near, far]: [f64; 2]) -> f64 {
+    if near > 0.0 { near } else { far }
+}
+
+/// The same for a quadrangle inside which the ray passes, before or behind its start.
+#[inline(always)]
+fn meet_quadrangle(view: &View<'_>, ray: &Ray, item: Item) -> Option<(f64, u32, Part)> {
+    let face = &view.quadrangles[item.index()];
+    if ray.leaving == face.plane.surface() {
+        return (face.rank > ray.after).then_some((0.0, face.rank, Part::WHOLE));
+    }
+    // The plane's distance, whichever its corners are: coincident faces are met at one place.
+    let plane = &view.planes[face.plane.index()];
+    let [point, normal] = [plane.point, plane.normal].map(DVec3::from_array);
+    let t = hit_plane(ray, point, normal).unwrap_or_else(|| {
+        let shear = Shear::new(ray.origin, ray.direction);
+        hit_chord(&shear.project_all(view.corners(&face.vertices)))
+    });
+    (t > 0.0).then_some((t, face.rank, Part::WHOLE))
 }
 
 /// The same for a triangle that the ray crosses at a distance `t`, before or behind its start.
@@ -154,7 +186,13 @@ pub(super) fn is_between(
         && meet_triangle(view, ray, item, t).is_some_and(|(t, ..)| t < ray.reach)
 }
 
-/// The same for a solid, up to `reach`.
+/// The same for a quadrangle that no such surface contains and inside which the ray passes.
+#[inline(always)]
+pub(super) fn is_quadrangle_between(view: &View<'_>, ray: &Ray, item: Item) -> bool {
+    meet_quadrangle(view, ray, item).is_some_and(|(t, ..)| t < ray.reach)
+}
+
+/// What [`meet`] tells, for a solid, up to `reach`.
 #[inline(never)]
 fn meet_solid(
     view: &View<'_>,

@@ -2,7 +2,10 @@
 
 use super::boxes::{BoxKernel, KernelWork, ScalarBoxes};
 #[cfg(target_arch = "x86_64")]
-use super::boxes_x86::{Avx2Boxes, Sse2Boxes};
+use super::{
+    boxes_avx512::Avx512Boxes,
+    boxes_x86::{Avx2Boxes, Sse2Boxes},
+};
 use crate::isa::Isa;
 
 /// Does work with the kernel of an instruction set, which this CPU must have.
@@ -14,8 +17,10 @@ pub(super) fn run_with_kernel<Input>(isa: Isa, input: &Input, work: &mut impl Ke
         Isa::Sse2 => work.run(input, Sse2Boxes::new()),
         #[cfg(target_arch = "x86_64")]
         Isa::Avx2 => Avx2Boxes::detect().expect(LACKING).run(input, work),
+        #[cfg(target_arch = "x86_64")]
+        Isa::Avx512 => Avx512Boxes::detect().expect(LACKING).run(input, work),
         #[cfg(not(target_arch = "x86_64"))]
-        Isa::Sse2 | Isa::Avx2 => panic!("{LACKING}"),
+        Isa::Sse2 | Isa::Avx2 | Isa::Avx512 => panic!("{LACKING}"),
     }
 }
 

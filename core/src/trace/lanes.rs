@@ -29,25 +29,31 @@ pub(super) const MOST_RAYS: usize = LANES * GROUPS;
 #[derive(Debug, Clone, Copy)]
 #[repr(C, align(64))]
 pub(super) struct RayGroup {
+    /// In the order of the axes of the rays' [`Shear`].
+    pub(super) origin: [[f64; LANES]; 3],
+    pub(super) slopes: [[f64; LANES]; 3],
+    /// In the order x, y, z.
+    pub(super) direction: [[f64; LANES]; 3],
+    /// The surface that a ray leaves in the lower half, what it went through in the upper half.
+    pub(super) leaving: [u64; LANES],
     pub(super) near_origin: [[f32; LANES]; 3],
     pub(super) far_origin: [[f32; LANES]; 3],
     pub(super) inverse: [[f32; LANES]; 3],
     pub(super) far_inverse: [[f32; LANES]; 3],
     pub(super) high: [f32; LANES],
-    /// In the order of the axes of the rays' [`Shear`].
-    pub(super) origin: [[f64; LANES]; 3],
-    pub(super) slopes: [[f64; LANES]; 3],
 }
 
 impl RayGroup {
     pub(super) const EMPTY: Self = Self {
+        origin: [[0.0; LANES]; 3],
+        slopes: [[0.0; LANES]; 3],
+        direction: [[0.0; LANES]; 3],
+        leaving: [0; LANES],
         near_origin: [[0.0; LANES]; 3],
         far_origin: [[0.0; LANES]; 3],
         inverse: [[0.0; LANES]; 3],
         far_inverse: [[0.0; LANES]; 3],
         high: [0.0; LANES],
-        origin: [[0.0; LANES]; 3],
-        slopes: [[0.0; LANES]; 3],
     };
 }
 
@@ -169,7 +175,9 @@ pub(super) fn fill(group: &mut RayGroup, rays: [&Ray; LANES], turn: &Turn) {
             group.inverse[axis][lane] = inverse;
             group.far_inverse[axis][lane] = inverse * FAR;
             group.origin[axis][lane] = ray.origin[turn.axes[axis]];
+            group.direction[axis][lane] = ray.direction[axis];
         }
+        group.leaving[lane] = u64::from(ray.after) << 32 | u64::from(ray.leaving.0);
         let [x, y, z] = turn.axes.map(|axis| ray.direction[axis]);
         group.slopes[0][lane] = x / z;
         group.slopes[1][lane] = y / z;

@@ -5,10 +5,14 @@ mod box_ray;
 mod boxes;
 #[cfg(target_arch = "x86_64")]
 #[expect(unsafe_code, reason = "SIMD intrinsics")]
+mod boxes_avx512;
+#[cfg(target_arch = "x86_64")]
+#[expect(unsafe_code, reason = "SIMD intrinsics")]
 mod boxes_x86;
 mod course;
 mod hit;
 pub(crate) mod kernels;
+mod lane_faces;
 mod lanes;
 mod packet;
 mod parallelepiped;

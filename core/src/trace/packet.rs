@@ -12,6 +12,7 @@
 use super::{
     box_ray::{BoxRay, FAR},
     boxes::BoxKernel,
+    lane_faces::{cross_sphere, leaves, pass_quadrangle},
     lanes::{Beam, GROUPS, LANES, MOST_RAYS, RayGroup, Turn, larger, shear_at, smaller},
     ray::{Ray, Shear},
     traversal::{STACK, Stack, Step, visit_from},
@@ -80,6 +81,17 @@ impl Span {
 pub(super) trait Meeting {
     /// The ray at a place in the packet crosses a triangle at a distance, before or behind its start.
     fn cross(&mut self, place: usize, item: Item, t: f64) -> Step;
+
+    /// Whether each ray meets this sphere or quadrangle as [`Meeting::cross_sphere`] and
+    /// [`Meeting::cross_quadrangle`] have it; else it is asked.
+    fn is_plain(&self, item: Item) -> bool;
+
+    /// The line of a ray that does not leave this sphere crosses it at two distances, the nearer one
+    /// first.
+    fn cross_sphere(&mut self, place: usize, item: Item, ends: [f64; 2]) -> Step;
+
+    /// The ray passes inside a quadrangle, before or behind its start.
+    fn cross_quadrangle(&mut self, place: usize, item: Item) -> Step;
 
     /// The ray may meet an item.
     fn ask(&mut self, place: usize, item: Item, shear: &Shear, box_ray: &BoxRay) -> Step;
@@ -206,6 +218,14 @@ impl Packet {
             let vertices = match item.kind() {
                 Some(Kind::Triangle) => &view.triangles[item.index()].vertices,
                 Some(Kind::Coplanar) => &view.coplanars[item.index()].vertices,
+                Some(Kind::Sphere) if meeting.is_plain(item) => {
+                    is_changed |= self.meet_sphere(view, (item, mask), meeting);
+                    continue;
+                }
+                Some(Kind::Quadrangle) if meeting.is_plain(item) => {
+                    is_changed |= self.meet_quadrangle(view, (item, mask), meeting);
+                    continue;
+                }
                 kind => {
                     for place in places(mask) {
                         let shear = self.shear(place);
@@ -238,6 +258,63 @@ impl Packet {
         }
     }
 
+    /// The rays of a mask meet a sphere; whether one reaches less far than before.
+    #[inline(always)]
+    fn meet_sphere(
+        &mut self,
+        view: &View<'_>,
+        (item, mask): (Item, u64),
+        meeting: &mut impl Meeting,
+    ) -> bool {
+        let sphere = &view.spheres[item.index()];
+        let mut is_changed = false;
+        for (k, asking) in groups(mask) {
+            let group = &self.groups[k];
+            let ends = cross_sphere(group, self.turn.axes, &sphere.center, sphere.radius);
+            let leaves = leaves(group, sphere.surface);
+            for lane in lanes(asking & (ends.met | leaves)) {
+                let place = LANES * k + lane;
+                let step = if leaves >> lane & 1 == 1 {
+                    meeting.ask(place, item, &self.shear(place), &BoxRay::NOWHERE)
+                } else {
+                    meeting.cross_sphere(place, item, [ends.near[lane], ends.far[lane]])
+                };
+                is_changed |= self.take(place, &step);
+            }
+        }
+        is_changed
+    }
+
+    /// The rays of a mask meet a quadrangle; whether one reaches less far than before.
+    #[inline(always)]
+    fn meet_quadrangle(
+        &mut self,
+        view: &View<'_>,
+        (item, mask): (Item, u64),
+        meeting: &mut impl Meeting,
+    ) -> bool {
+        let face = &view.quadrangles[item.index()];
+        let [x, y, z] = self.turn.axes;
+        let mut corners = [[0.0; 3]; 4];
+        for (corner, vertex) in corners.iter_mut().zip(view.corners(&face.vertices)) {
+            *corner = [vertex[x], vertex[y], vertex[z]];
+        }
+        let mut is_changed = false;
+        for (k, asking) in groups(mask) {
+            let (inside, in_doubt) = pass_quadrangle(&self.groups[k], &corners);
+            for lane in lanes(asking & (inside | in_doubt)) {
+                let place = LANES * k + lane;
+                let step = if in_doubt >> lane & 1 == 1 {
+                    meeting.ask(place, item, &self.shear(place), &BoxRay::NOWHERE)
+                } else {
+                    meeting.cross_quadrangle(place, item)
+                };
+                is_changed |= self.take(place, &step);
+            }
+        }
+        is_changed
+    }
+
     /// A ray goes on alone in a child.
     #[inline(always)]
     fn visit_alone(
@@ -267,6 +344,23 @@ fn places(mut mask: u64) -> impl Iterator<Item = usize> {
             place % MOST_RAYS
         })
     })
+}
+
+/// The groups in which a mask has rays, each with its part of the mask.
+#[inline(always)]
+fn groups(mut mask: u64) -> impl Iterator<Item = (usize, u64)> {
+    std::iter::from_fn(move || {
+        let k = mask.trailing_zeros() as usize / LANES % GROUPS;
+        let asking = mask >> (LANES * k) & 0xFF;
+        mask &= !(0xFF << (LANES * k));
+        (asking != 0).then_some((k, asking))
+    })
+}
+
+/// The lanes of a group's part of a mask.
+#[inline(always)]
+fn lanes(asking: u64) -> impl Iterator<Item = usize> {
+    places(asking).map(|place| place % LANES)
 }
 
 /// Takes a packet through the hierarchy: every ray meets the items in the leaves that it enters.

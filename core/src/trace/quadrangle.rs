@@ -40,22 +40,6 @@ pub(super) fn is_inside_in_doubt(corners: &[Projected; 4], is_in_doubt: &mut boo
     inside
 }
 
-/// The distance at which the ray crosses the quadrangle in the plane through `point` with the
-/// unit `normal`, in units of its direction; `None` where it passes by.
-#[inline(always)]
-pub(super) fn hit_quadrangle(
-    ray: &Ray,
-    corners: &[Projected; 4],
-    point: DVec3,
-    normal: DVec3,
-) -> Option<f64> {
-    if !is_inside(corners) {
-        return None;
-    }
-    // The plane's distance, whichever its corners are: coincident faces are met at one place.
-    Some(hit_plane(ray, point, normal).unwrap_or_else(|| hit_chord(corners)))
-}
-
 /// The distance to a plane; `None` for a ray that as good as runs along it, for which the division
 /// would give any place in the plane.
 #[inline(always)]
@@ -74,7 +58,7 @@ pub(super) fn toward_plane(ray: &Ray, point: DVec3, normal: DVec3) -> (f64, f64)
 /// The distance of a quadrangle seen edge-on, by interpolation between the two edges right and
 /// left of the ray.
 #[cold]
-fn hit_chord(corners: &[Projected; 4]) -> f64 {
+pub(super) fn hit_chord(corners: &[Projected; 4]) -> f64 {
     let [mut left, mut right] = [(f64::NEG_INFINITY, 0.0), (f64::INFINITY, 0.0)];
     for (k, a) in corners.iter().enumerate() {
         let b = &corners[(k + 1) % 4];

@@ -1,6 +1,7 @@
 //! Vertices and polygons as a file gives them into a mesh without copies.
 
 use hashbrown::hash_table::Entry;
+use rayon::prelude::*;
 
 use glam::DVec3;
 
@@ -157,15 +158,32 @@ impl<T: Copy + Into<f64>> MeshBuilder<T> {
             *start -= 1;
             order[*start as usize] = index as u32;
         }
-        let mut copies: Vec<u32> = Vec::new();
-        for bounds in starts.windows(2) {
-            let group = &mut order[bounds[0] as usize..bounds[1] as usize];
-            group.sort_unstable_by_key(|&index| (turned(triangles[index as usize]), index));
-            let is_copy = |pair: &&[u32]| {
-                turned(triangles[pair[0] as usize]) == turned(triangles[pair[1] as usize])
-            };
-            copies.extend(group.windows(2).filter(is_copy).map(|pair| pair[1]));
-        }
+        let find_copies = |(starts, order): (&[u32], &mut [u32])| {
+            let mut copies: Vec<u32> = Vec::new();
+            let mut rest = order;
+            for bounds in starts.windows(2) {
+                let group;
+                (group, rest) = rest.split_at_mut((bounds[1] - bounds[0]) as usize);
+                group.sort_unstable_by_key(|&index| (turned(triangles[index as usize]), index));
+                let is_copy = |pair: &&[u32]| {
+                    turned(triangles[pair[0] as usize]) == turned(triangles[pair[1] as usize])
+                };
+                copies.extend(group.windows(2).filter(is_copy).map(|pair| pair[1]));
+            }
+            copies
+        };
+        let mut rest = &mut order[..];
+        let runs: Vec<(&[u32], &mut [u32])> = (0..self.vertices.len())
+            .step_by(CORNERS_AT_ONCE)
+            .map(|first| {
+                let starts = &starts[first..(first + CORNERS_AT_ONCE + 1).min(starts.len())];
+                let count = (starts[starts.len() - 1] - starts[0]) as usize;
+                let (run, later) = std::mem::take(&mut rest).split_at_mut(count);
+                rest = later;
+                (starts, run)
+            })
+            .collect();
+        let mut copies: Vec<u32> = runs.into_par_iter().flat_map_iter(find_copies).collect();
         if copies.is_empty() {
             return;
         }
@@ -221,6 +239,9 @@ impl MeshBuilder<f64> {
         })
     }
 }
+
+/// A thread looks for copies among the triangles of so many smallest corners in one go.
+const CORNERS_AT_ONCE: usize = 1 << 14;
 
 /// Turns a triangle so that it begins with its smallest index.
 fn turned([a, b, c]: [u32; 3]) -> [u32; 3] {

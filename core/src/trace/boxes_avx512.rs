@@ -1,0 +1,146 @@
+//! The kernel with AVX-512: a triangle is tried on eight rays at once. Boxes are AVX2's, eight lanes
+//! of f32.
+
+use std::arch::x86_64::{
+    _CMP_GT_OQ, _CMP_LT_OQ, _mm512_abs_pd, _mm512_add_pd, _mm512_cmp_pd_mask, _mm512_div_pd,
+    _mm512_load_pd, _mm512_max_pd, _mm512_min_pd, _mm512_mul_pd, _mm512_set1_pd, _mm512_setzero_pd,
+    _mm512_storeu_pd, _mm512_sub_pd,
+};
+
+use super::{
+    box_ray::BoxRay,
+    boxes::{BoxKernel, KernelWork},
+    boxes_x86::{Avx2Boxes, Sse2Boxes},
+    lanes::{Beam, Crossings, GROUPS, LANES, RayGroup, Turn},
+    ray::Ray,
+};
+use crate::prepared::node::{Frame, Node};
+
+/// The kernel with AVX-512 (F and VL). [`Avx512Boxes::detect`] makes it on CPUs that have these, and
+/// nothing else does.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Avx512Boxes(Avx2Boxes);
+
+impl Avx512Boxes {
+    /// `None` on a CPU without AVX-512.
+    pub(super) fn detect() -> Option<Self> {
+        let has_all = std::arch::is_x86_feature_detected!("avx512f")
+            && std::arch::is_x86_feature_detected!("avx512vl");
+        Avx2Boxes::detect().filter(|_| has_all).map(Self)
+    }
+
+    /// Does work that is compiled for AVX-512 together with the kernel.
+    pub(super) fn run<Input>(self, input: &Input, work: &mut impl KernelWork<Input>) {
+        #[target_feature(enable = "avx2,avx512f,avx512vl")]
+        fn run_compiled_for_avx512<Input>(
+            kernel: Avx512Boxes,
+            input: &Input,
+            work: &mut impl KernelWork<Input>,
+        ) {
+            work.run(input, kernel);
+        }
+        // SAFETY: a value of this type says that the CPU has AVX-512, and the one in it AVX2.
+        unsafe { run_compiled_for_avx512(self, input, work) }
+    }
+}
+
+impl BoxKernel for Avx512Boxes {
+    type Plain = Sse2Boxes;
+
+    #[inline(always)]
+    fn plain(self) -> Sse2Boxes {
+        self.0.plain()
+    }
+
+    #[inline(always)]
+    fn test(self, node: &Node, ray: &BoxRay) -> ([f32; 8], u32) {
+        self.0.test(node, ray)
+    }
+
+    #[inline(always)]
+    fn classify(self, rays: [&Ray; 4], frame: &Frame) -> [u64; 4] {
+        self.0.classify(rays, frame)
+    }
+
+    #[inline(always)]
+    fn fill(self, group: &mut RayGroup, rays: [&Ray; LANES], turn: &Turn) {
+        self.0.fill(group, rays, turn);
+    }
+
+    #[inline(always)]
+    fn enter(self, groups: &[RayGroup; GROUPS], planes: [[f32; 3]; 2], mask: u64) -> u64 {
+        self.0.enter(groups, planes, mask)
+    }
+
+    #[inline(always)]
+    fn meet_beam(self, node: &Node, beam: &Beam) -> ([f32; 8], u32) {
+        self.0.meet_beam(node, beam)
+    }
+
+    #[inline(always)]
+    fn cross(
+        self,
+        groups: &[RayGroup; GROUPS],
+        corners: &[[f64; 3]; 3],
+        mask: u64,
+        distances: &mut [[f64; LANES]; GROUPS],
+    ) -> Crossings {
+        let mut crossings = Crossings::default();
+        let mut left = mask;
+        while left != 0 {
+            let k = left.trailing_zeros() as usize / LANES % GROUPS;
+            let asking = left >> (LANES * k) & 0xFF;
+            left &= !(0xFF << (LANES * k));
+            let group = &groups[k];
+            // SAFETY: a value of this type says that the CPU has AVX-512. The loads, aligned as the
+            // group is, and the store take arrays of exactly 8 numbers.
+            let [possible, certain] = unsafe {
+                let load = |lanes: &[f64; LANES]| _mm512_load_pd(lanes.as_ptr());
+                let origin =
+                    [load(&group.origin[0]), load(&group.origin[1]), load(&group.origin[2])];
+                let slopes = [load(&group.slopes[0]), load(&group.slopes[1])];
+                let zero = _mm512_setzero_pd();
+                let [mut x, mut y, mut depth] = [[zero; 3]; 3];
+                for (corner, at) in corners.iter().enumerate() {
+                    depth[corner] = _mm512_sub_pd(_mm512_set1_pd(at[2]), origin[2]);
+                    let right = _mm512_sub_pd(_mm512_set1_pd(at[0]), origin[0]);
+                    let up = _mm512_sub_pd(_mm512_set1_pd(at[1]), origin[1]);
+                    x[corner] = _mm512_sub_pd(right, _mm512_mul_pd(slopes[0], depth[corner]));
+                    y[corner] = _mm512_sub_pd(up, _mm512_mul_pd(slopes[1], depth[corner]));
+                }
+                let edge = |a: usize, b: usize| {
+                    _mm512_sub_pd(_mm512_mul_pd(x[a], y[b]), _mm512_mul_pd(y[a], x[b]))
+                };
+                let over = [edge(1, 2), edge(2, 0), edge(0, 1)];
+                let least = _mm512_min_pd(over[0], _mm512_min_pd(over[1], over[2]));
+                let most = _mm512_max_pd(over[0], _mm512_max_pd(over[1], over[2]));
+                let is_below = _mm512_cmp_pd_mask::<_CMP_LT_OQ>(least, zero);
+                let is_above = _mm512_cmp_pd_mask::<_CMP_GT_OQ>(most, zero);
+                let possible = u64::from(!(is_below & is_above)) & asking;
+                if possible == 0 {
+                    continue;
+                }
+                let of_corner = |c: usize| _mm512_max_pd(_mm512_abs_pd(x[c]), _mm512_abs_pd(y[c]));
+                let extent = _mm512_max_pd(of_corner(0), _mm512_max_pd(of_corner(1), of_corner(2)));
+                let area = _mm512_add_pd(_mm512_add_pd(over[0], over[1]), over[2]);
+                let bound = _mm512_mul_pd(_mm512_mul_pd(extent, extent), _mm512_set1_pd(0.125));
+                let is_plain = _mm512_cmp_pd_mask::<_CMP_GT_OQ>(_mm512_abs_pd(area), bound);
+                let is_one_sided = _mm512_cmp_pd_mask::<_CMP_GT_OQ>(least, zero)
+                    | _mm512_cmp_pd_mask::<_CMP_LT_OQ>(most, zero);
+                let slope = load(&group.slopes[2]);
+                let z = depth.map(|depth| _mm512_mul_pd(slope, depth));
+                let weighted = |k: usize| _mm512_mul_pd(over[k], z[k]);
+                let sum = _mm512_add_pd(_mm512_add_pd(weighted(0), weighted(1)), weighted(2));
+                let nearest = _mm512_min_pd(_mm512_min_pd(z[0], z[1]), z[2]);
+                let farthest = _mm512_max_pd(_mm512_max_pd(z[0], z[1]), z[2]);
+                let t = _mm512_max_pd(_mm512_div_pd(sum, area), nearest);
+                let t = _mm512_min_pd(t, farthest);
+                _mm512_storeu_pd(distances[k].as_mut_ptr(), t);
+                [possible, u64::from(is_plain & is_one_sided) & possible]
+            };
+            crossings.possible |= possible << (LANES * k);
+            crossings.certain |= certain << (LANES * k);
+        }
+        crossings
+    }
+}
