@@ -114,6 +114,11 @@ pub(crate) fn positions(samples: &[Sample; AT_ONCE]) -> [[f64; AT_ONCE]; 2] {
 pub(crate) struct GatherNumbers(Sample);
 
 impl GatherNumbers {
+    /// The numbers of one of several rays: together those of all samples are one sequence.
+    pub(crate) fn of_ray(self, ray: u32, ray_count: u32) -> Self {
+        Self(Sample { index: self.0.index * ray_count + ray, ..self.0 })
+    }
+
     /// Decides by Russian roulette whether the ray is sent.
     pub(crate) fn roulette(&self) -> f64 {
         self.fraction(1)

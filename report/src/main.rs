@@ -3,6 +3,7 @@
 //!
 //! `cargo run --release -p rtfarm-report -- --out DIR`; on a user's own scene, `rtfarm report SCENE`.
 
+mod branches;
 mod kernels;
 mod peers;
 mod tables;
@@ -146,7 +147,8 @@ fn measure(plan: &Plan, peers: Option<&Path>) -> anyhow::Result<Report> {
         ladders_beside.push(ladder);
     }
 
-    let text = tables::on_known(&ladders, &ladders_beside, &cases, plan.kernels);
+    let branches = branches::table(plan.width / 2, plan.reach.seeds);
+    let text = tables::on_known(&ladders, &ladders_beside, &branches, &cases, plan.kernels);
     let mut plots = vec![
         (ERROR_PLOT, plot::draw_errors(&ladders)?),
         (tables::KERNEL_PLOT, tables::draw_kernels(&cases)?),

@@ -15,10 +15,12 @@ use crate::kernels::{Amount, Case, Kernel, names};
 pub(crate) const PEERS_PLOT: &str = "peers.svg";
 pub(crate) const KERNEL_PLOT: &str = "kernels.svg";
 
-/// The report on pictures and distances that are known; `beside` other renderers.
+/// The report on pictures and distances that are known; `beside` other renderers, `branches` the
+/// section on what is followed by chance.
 pub(crate) fn on_known(
     ladders: &[Ladder],
     beside: &[Ladder],
+    branches: &str,
     cases: &[Case],
     amount: Amount,
 ) -> String {
@@ -31,6 +33,7 @@ pub(crate) fn on_known(
     if !beside.is_empty() {
         text += &peers(beside);
     }
+    text += branches;
     text += &kernels(cases, amount);
     text += &method(ladders);
     let _ = writeln!(

@@ -58,6 +58,7 @@ fn a_report_has_a_table_for_each_scene_and_a_plot() {
     for part in [
         "## How well a render tells its error",
         "## Adaptive against fixed samples",
+        "## Branches by chance, and whole trees",
         "## Kernels",
         "| 1e9 | corners | 500 | ",
         "## Method",

@@ -1,12 +1,12 @@
-//! Points gather the light that other faces send on: each sends one ray, where little counts only
-//! now and then, and where the ray meets such a face, that place is lit in its turn and gives what
+//! Points gather the light that other faces send on: each sends a ray, where little counts only
+//! now and then, among many such faces some, and where the ray meets such a face, that place is lit in its turn and gives what
 //! it can.
 
 use std::ops::ControlFlow;
 
 use super::{
     importance::Receiver,
-    sampling::{self, LightSample},
+    sampling::{self, LightPlan, LightSample},
 };
 use crate::{
     isa::Isa,
@@ -83,7 +83,7 @@ impl Queue {
 }
 
 impl Gatherer {
-    /// Makes a ray from every point that survives.
+    /// Makes the rays of every point that survives.
     pub(crate) fn start(&mut self, view: &View<'_>, points: &[Point], samples: &[Sample]) {
         self.queue.clear();
         for (k, point) in points.iter().enumerate() {
@@ -93,16 +93,21 @@ impl Gatherer {
                 continue;
             }
             let receiver = Receiver { position: point.position, normal: point.normal };
-            let Some(sample) = sampling::sample_light(view, &receiver, &numbers) else { continue };
-            let ray = Ray {
-                origin: point.position,
-                direction: sample.direction,
-                reach: f64::INFINITY,
-                leaving: point.surface,
-                after: Ray::NOTHING_AHEAD,
-            };
-            let throughput = 1.0 / survival;
-            self.queue.push(ray, Path { point: k, receiver, sample, throughput, distance: 0.0 });
+            let plan = LightPlan::new(view, &receiver);
+            let ray_count = if survival < 1.0 { 1 } else { plan.ray_count() };
+            let throughput = 1.0 / (survival * f64::from(ray_count));
+            for ray in 0..ray_count {
+                let Some(sample) = plan.sample(&numbers.of_ray(ray, ray_count)) else { continue };
+                let ray = Ray {
+                    origin: point.position,
+                    direction: sample.direction,
+                    reach: f64::INFINITY,
+                    leaving: point.surface,
+                    after: Ray::NOTHING_AHEAD,
+                };
+                self.queue
+                    .push(ray, Path { point: k, receiver, sample, throughput, distance: 0.0 });
+            }
         }
     }
 

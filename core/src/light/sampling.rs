@@ -46,53 +46,74 @@ fn hemisphere_probability(importance: &Importance) -> f64 {
     if hemisphere < MOST_HEMISPHERE && !importance.fills_hemisphere() { hemisphere } else { 1.0 }
 }
 
-/// Chooses a direction: one sample from a mixture of the cosine-weighted hemisphere and all
-/// emitters. It is `None` where the one chosen leads below the receiver's horizon.
-///
-/// Source: Veach & Guibas, "Optimally Combining Sampling Techniques for Monte Carlo Rendering"
-/// (1995): the balance heuristic, here for the light of each emitter on its own, so that only the
-/// chosen one's density must be known.
-#[inline]
-pub(super) fn sample_light(
-    view: &View<'_>,
-    receiver: &Receiver,
-    numbers: &GatherNumbers,
-) -> Option<LightSample> {
-    // No emitter on record can be chosen.
-    if view.emitters.is_empty() {
-        return sample_hemisphere(receiver, 1.0, numbers.direction());
+/// How a receiver looks for light: with how many rays, and how each chooses its direction.
+pub(super) struct LightPlan<'a> {
+    view: &'a View<'a>,
+    receiver: &'a Receiver,
+    /// `None` where no emitter is on record, so that none can be chosen.
+    cut: Option<LightCut>,
+    /// The probability, above 0 and up to 1, with which a ray samples the whole hemisphere.
+    hemisphere: f64,
+}
+
+/// How many rays a receiver sends whose hemisphere is full of emitters: aiming at them is no gain, and
+/// where light comes from everywhere its noise is most of a picture's. Measured on a bowl and a room.
+const RAYS_AMONG_EMITTERS: u32 = 4;
+
+impl<'a> LightPlan<'a> {
+    /// That of a receiver.
+    #[inline]
+    pub(super) fn new(view: &'a View<'a>, receiver: &'a Receiver) -> Self {
+        let cut = (!view.emitters.is_empty()).then(|| LightCut::new(view, receiver));
+        let hemisphere = cut.as_ref().map_or(1.0, |cut| hemisphere_probability(cut.total()));
+        Self { view, receiver, cut, hemisphere }
     }
-    let cut = LightCut::new(view, receiver);
-    let hemisphere = hemisphere_probability(cut.total());
-    let choice = if hemisphere < 1.0 { numbers.choice() } else { 0.0 };
-    if choice < hemisphere {
-        return sample_hemisphere(receiver, hemisphere, numbers.direction());
+
+    /// How many rays the receiver sends.
+    pub(super) fn ray_count(&self) -> u32 {
+        let is_among = self.cut.as_ref().is_some_and(|cut| cut.total().fills_hemisphere());
+        if is_among { RAYS_AMONG_EMITTERS } else { 1 }
     }
-    let rest = (choice - hemisphere) / (1.0 - hemisphere);
-    let (index, probability) = cut.choose(view, receiver, rest)?;
-    let emitter = &view.emitters[index as usize];
-    let (direction, distance) = if emitter.is_sphere() {
-        (sample_sphere(emitter, receiver, numbers.direction())?, 0.0)
-    } else {
-        sample_polygon(view, emitter, receiver, numbers.direction())?
-    };
-    let cosine = receiver.normal.dot(direction);
-    if cosine <= 0.0 || !cosine.is_finite() {
-        return None;
+
+    /// Chooses a direction: one sample from a mixture of the cosine-weighted hemisphere and all
+    /// emitters. It is `None` where the one chosen leads below the receiver's horizon.
+    ///
+    /// Source: Veach & Guibas, "Optimally Combining Sampling Techniques for Monte Carlo Rendering"
+    /// (1995): the balance heuristic, here for the light of each emitter on its own, so that only the
+    /// chosen one's density must be known.
+    #[inline]
+    pub(super) fn sample(&self, numbers: &GatherNumbers) -> Option<LightSample> {
+        let Self { view, receiver, hemisphere, .. } = *self;
+        let choice = if hemisphere < 1.0 { numbers.choice() } else { 0.0 };
+        let Some(cut) = self.cut.as_ref().filter(|_| choice >= hemisphere) else {
+            return sample_hemisphere(receiver, hemisphere, numbers.direction());
+        };
+        let rest = (choice - hemisphere) / (1.0 - hemisphere);
+        let (index, probability) = cut.choose(view, receiver, rest)?;
+        let emitter = &view.emitters[index as usize];
+        let (direction, distance) = if emitter.is_sphere() {
+            (sample_sphere(emitter, receiver, numbers.direction())?, 0.0)
+        } else {
+            sample_polygon(view, emitter, receiver, numbers.direction())?
+        };
+        let cosine = receiver.normal.dot(direction);
+        if cosine <= 0.0 || !cosine.is_finite() {
+            return None;
+        }
+        let density = hemisphere
+            + (1.0 - hemisphere)
+                * probability
+                * relative_density(emitter, receiver, direction, distance);
+        Some(LightSample {
+            direction,
+            hemisphere_probability: hemisphere,
+            emitter: Some((index, density)),
+        })
     }
-    let density = hemisphere
-        + (1.0 - hemisphere)
-            * probability
-            * relative_density(emitter, receiver, direction, distance);
-    Some(LightSample {
-        direction,
-        hemisphere_probability: hemisphere,
-        emitter: Some((index, density)),
-    })
 }
 
 /// The probability density, relative to the density cosine / π of the hemisphere, with which
-/// [`sample_light`] chooses `direction` for what an emitter gives that is met at `distance`.
+/// [`LightPlan::sample`] chooses `direction` for what an emitter gives that is met at `distance`.
 /// `hemisphere` is the probability, below 1, with which the whole hemisphere is sampled. A face
 /// that is no emitter on record, whose index is `None`, is never sampled itself.
 #[inline]

@@ -142,7 +142,22 @@ pub(super) struct Pixel {
     contrast: DVec3,
     /// The variance that faces add which no sample has met.
     unseen: DVec3,
+    /// The noise of the pixels beside it, where that is alike.
+    noise: Option<Noise>,
 }
+
+/// What the first round of the pixels beside one tells of its noise, channel by channel.
+#[derive(Debug, Clone, Copy)]
+struct Noise {
+    /// The variance of one sample.
+    of_one: DVec3,
+    /// The variance of the mean of [`FEWEST_FOR_ERROR`] samples, as runs tell it.
+    of_round: DVec3,
+}
+
+/// Pixels in a common noise have variances of one sample within about this factor of each other: of
+/// eight samples of a normal law one in 300 has less than an eighth. Beside an edge they have not.
+const ALIKE: f64 = 8.0;
 
 /// The variance of the mean where an edge crosses a pixel is about this times the samples' own
 /// variance times n^-1.5. Measured on outlines of spheres and polygons.
@@ -163,8 +178,10 @@ const DECISION_OF_RUNS: f64 = 1.0 / 4.0;
 const HIDDEN: f64 = 1.0 / 128.0;
 
 /// What counts of a missed contrast in the error that is told, while decisions fear all of it: of the
-/// pixels that stay beside an edge it crosses some only.
+/// pixels that stay beside an edge it crosses some only. Later it also stands for what pixels hide that
+/// stopped where samples agree by chance; in the first round few do.
 const CROSSED: f64 = 0.75;
+const CROSSED_AT_FIRST: f64 = 0.3;
 
 /// A channel is certainly above full light if its mean is by so many standard errors.
 const CERTAIN: f64 = 4.0;
@@ -195,6 +212,27 @@ impl Pixel {
             contrast_around: neighbourhood.contrast(),
             contrast: DVec3::ZERO,
             unseen: DVec3::ZERO,
+            noise: None,
+        }
+    }
+
+    /// Notes the noise of a neighbourhood, which has this pixel too, if it is alike and all have had
+    /// the first round. The own samples are left out: where they decide when to stop, those whose
+    /// samples agree by chance stop, and that is a bias of their mean, as it hangs together with
+    /// their variance, and of the error they tell.
+    pub(super) fn set_noise<'a>(&mut self, around: &(impl Iterator<Item = &'a Self> + Clone)) {
+        let count = around.clone().count();
+        if count < 2 || around.clone().any(|pixel| pixel.count() < FEWEST_FOR_ERROR) {
+            return;
+        }
+        let of_others = |variance: &dyn Fn(&Self) -> DVec3| {
+            let of_all = around.clone().map(variance).sum::<DVec3>();
+            (of_all - variance(self)).max(DVec3::ZERO) / (count - 1) as f64
+        };
+        let of_one = of_others(&Self::variance_of_one);
+        if around.clone().all(|pixel| (ALIKE * pixel.variance_of_one()).cmpge(of_one).all()) {
+            let of_round = of_others(&|pixel| pixel.runs.variance().unwrap_or_default());
+            self.noise = Some(Noise { of_one, of_round });
         }
     }
 
@@ -233,21 +271,33 @@ impl Pixel {
     /// agree by chance is wrong, and then tells the contrary.
     pub(super) fn estimate(&self, wanted: &Wanted) -> Estimate {
         let of_samples = if self.runs.count == 1 { self.around } else { self.runs.variance() };
-        let missed = CROSSED * self.missed_variance();
+        let is_first_round = self.runs.count <= FEWEST_FOR_ERROR;
+        let crossed = if is_first_round { CROSSED_AT_FIRST } else { CROSSED };
+        let missed = crossed * self.missed_variance();
         let variance =
             of_samples.map(|variance| self.unclipped(variance + missed + self.unseen, wanted));
         Estimate { mean: self.runs.mean(), variance }
     }
 
     /// Whether the standard error is expected to be small enough in each channel: nearly that of
-    /// an edge with the same samples, but runs that lie far apart keep the pixel open.
+    /// an edge with the same samples, but runs that lie far apart keep the pixel open. In a common
+    /// noise the neighbours' samples tell both.
     pub(super) fn is_done(&self, wanted: &Wanted) -> bool {
         let n = f64::from(self.runs.count);
         let of_samples = if self.runs.count == 1 {
             self.around
         } else {
-            let of_edge = self.variance_of_one() * (EDGE / (n * n.sqrt()));
-            self.runs.variance().map(|of_runs| of_edge.lerp(of_runs, DECISION_OF_RUNS))
+            let of_one = self.variance_of_one();
+            let noise = self.noise.filter(|noise| of_one.cmple(ALIKE * noise.of_one).all());
+            let (of_one, of_runs) = match noise {
+                Some(Noise { of_one, of_round }) => {
+                    let rounds = n / f64::from(FEWEST_FOR_ERROR);
+                    (of_one, Some(of_round / (rounds * rounds.sqrt())))
+                }
+                None => (of_one, self.runs.variance()),
+            };
+            let of_edge = of_one * (EDGE / (n * n.sqrt()));
+            of_runs.map(|of_runs| of_edge.lerp(of_runs, DECISION_OF_RUNS))
         };
         of_samples.is_some_and(|variance| {
             let variance = variance + self.missed_variance() + self.unseen;
@@ -377,6 +427,33 @@ mod tests {
         let edge = pixel(0.0, [0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 1.0]);
         assert_eq!(edge.estimate(&wanted(1.0)).variance, Some(DVec3::ZERO));
         assert!(!edge.is_done(&wanted(8.0 / 255.0)));
+    }
+
+    #[test]
+    fn in_a_common_noise_the_neighbours_decide() {
+        let noisy = [0.9, 0.1, 0.8, 0.2, 0.9, 0.1, 0.7];
+        let calm = [0.5, 0.51, 0.49, 0.5, 0.52, 0.5, 0.5];
+        let decide = |own: &[f64], others: [&[f64]; 8], more: usize| {
+            let mut own = pixel(0.5, own.iter().copied());
+            let others = others.map(|others| pixel(0.5, others.iter().copied()));
+            own.set_noise(&others.iter().chain([&own.clone()]));
+            (0..more).for_each(|_| own.add(DVec3::splat(0.5)));
+            own.is_done(&wanted(0.03))
+        };
+        // Whose samples agree by chance goes on as the others do, and stops when they would.
+        let lucky = [0.3, 0.7, 0.4, 0.5, 0.7, 0.3, 0.6];
+        assert!(pixel(0.5, lucky).is_done(&wanted(0.03)) && !decide(&lucky, [&noisy; 8], 0));
+        assert!(decide(&noisy, [&noisy; 8], 56));
+        // What another kind of pixel tells counts for nothing, on either side.
+        let mut mixed = [&noisy[..]; 8];
+        mixed[3] = &calm;
+        assert!(decide(&lucky, mixed, 0) && !decide(&noisy, [&calm; 8], 0));
+        // Nor does it where later samples see what no neighbour did.
+        let mut surprised = pixel(0.5, [0.5; 7]);
+        surprised.set_noise(&[pixel(0.5, [0.5; 7]); 9].iter());
+        assert!(surprised.is_done(&wanted(0.03)));
+        (0..8).for_each(|k| surprised.add(DVec3::splat(f64::from(k % 2))));
+        assert!(!surprised.is_done(&wanted(0.03)));
     }
 
     #[test]

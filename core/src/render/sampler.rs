@@ -136,8 +136,9 @@ impl<'a> Sampler<'a> {
         let mut open = Vec::new();
         for (index, (x, y)) in (0..).zip(area.pixels()) {
             let mut pixel = pixels[far.index_of(x, y) as usize];
-            let ranges = neighbours(far, x, y).map(|index| pixels[index as usize].range());
-            pixel.set_contrast(ranges);
+            let around = neighbours(far, x, y).map(|index| &pixels[index as usize]);
+            pixel.set_contrast(around.clone().map(Pixel::range));
+            pixel.set_noise(&around);
             let unseen = found.next_if(|&(at, _)| at == index).map(|(_, unseen)| unseen);
             let mut pixel = OpenPixel { index, pixel, unseen };
             pixel.note_samples(search.as_ref(), area, seed, 1);
@@ -307,7 +308,7 @@ fn pixels_by_blocks(area: Area) -> Vec<u32> {
 }
 
 /// The pixel (x, y) of the frame and its neighbours, by their places in an area that has them.
-fn neighbours(area: Area, x: u32, y: u32) -> impl Iterator<Item = u32> {
+fn neighbours(area: Area, x: u32, y: u32) -> impl Iterator<Item = u32> + Clone {
     let [columns, rows] = [(x, area.columns()), (y, area.rows())]
         .map(|(middle, all)| all.start.max(middle.saturating_sub(1))..all.end.min(middle + 2));
     rows.flat_map(move |y| columns.clone().map(move |x| area.index_of(x, y)))
