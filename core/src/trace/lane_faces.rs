@@ -20,9 +20,9 @@ pub(super) fn cross_sphere(
     radius: f64,
 ) -> SphereEnds {
     let mut to_origin = [[0.0; LANES]; 3];
-    for (place, axis) in axes.into_iter().enumerate() {
-        for lane in 0..LANES {
-            to_origin[axis % 3][lane] = group.origin[place][lane] - center[axis % 3];
+    for (axis, starts) in axes.into_iter().zip(&group.origin) {
+        for (difference, start) in to_origin[axis % 3].iter_mut().zip(starts) {
+            *difference = start - center[axis % 3];
         }
     }
     let ([x, y, z], [dx, dy, dz]) = (&to_origin, &group.direction);
@@ -91,8 +91,8 @@ pub(super) fn pass_quadrangle(group: &RayGroup, corners: &[[f64; 3]; 4]) -> (u64
             let rounded = x[a][lane] * y[b][lane] - y[a][lane] * x[b][lane];
             let upward = y[b][lane] > 0.0;
             let crosses = upward != (y[a][lane] > 0.0);
-            inside ^= u64::from(crosses & ((rounded > 0.0) == upward)) << lane;
-            in_doubt |= u64::from(crosses & (rounded == 0.0)) << lane;
+            inside ^= u64::from(crosses && (rounded > 0.0) == upward) << lane;
+            in_doubt |= u64::from(crosses && rounded == 0.0) << lane;
         }
     }
     (inside, in_doubt)
