@@ -130,7 +130,10 @@ impl BoxRay {
         let relative = (origin - DVec3::from_array(frame.origin)) * frame.scale;
         let mut ray = Self { start: 0.0, scale: frame.scale, slack: 0.0, ..*self };
         for axis in 0..3 {
-            let (low, high) = (below(relative[axis] - 1e-25), above(relative[axis] + 1e-25));
+            // More than rounding to f32 takes, without a look at how it rounds.
+            let place = relative[axis] as f32;
+            let slack = 2.0 * f32::EPSILON * place.abs() + 1e-25;
+            let (low, high) = (place - slack, place + slack);
             let forward = ray.near[axis] == axis;
             ray.near_origin[axis] = if forward { high } else { low };
             ray.far_origin[axis] = if forward { low } else { high };

@@ -101,12 +101,14 @@ impl BoxKernel for Avx2Boxes {
 
     #[inline(always)]
     fn cross_box(self, ray: &Ray, left_at: f64, planes: &BoxPlanes) -> ([f64; 2], f64) {
-        parallelepiped_x86::cross_box_with_avx2(self, ray, left_at, planes)
+        // SAFETY: a value of this type says that the CPU has AVX2.
+        unsafe { parallelepiped_x86::cross_box_with_avx2(ray, left_at, planes) }
     }
 
     #[inline(always)]
     fn face_at(self, (ray, left_at): (&Ray, f64), planes: &BoxPlanes, t: f64, enters: bool) -> u32 {
-        parallelepiped_x86::face_at_with_avx2(self, (ray, left_at), planes, t, enters)
+        // SAFETY: a value of this type says that the CPU has AVX2.
+        unsafe { parallelepiped_x86::face_at_with_avx2((ray, left_at), planes, t, enters) }
     }
 
     #[inline(always)]

@@ -9,7 +9,7 @@ use std::arch::x86_64::{
     _mm256_mul_pd, _mm256_set1_pd, _mm256_setzero_pd, _mm256_sub_pd,
 };
 
-use super::{boxes_x86::Avx2Boxes, ray::Ray};
+use super::ray::Ray;
 use crate::prepared::record::BoxPlanes;
 
 /// The operations of `PlaneCrossings`, for two faces at a time. The numbers are the same.
@@ -68,15 +68,14 @@ fn cross_box_with_sse2(ray: &Ray, left_at: f64, planes: &BoxPlanes) -> ([f64; 2]
 
 /// The operations of `PlaneCrossings`, for four faces at a time: where the line crosses the planes of
 /// `face` and the three after it, and how fast it goes outward there.
+///
+/// # Safety
+///
+/// The CPU has AVX2.
 #[inline(always)]
-fn cross_four(
-    _: Avx2Boxes,
-    (ray, left_at): (&Ray, f64),
-    planes: &BoxPlanes,
-    face: usize,
-) -> [__m256d; 2] {
+unsafe fn cross_four((ray, left_at): (&Ray, f64), planes: &BoxPlanes, face: usize) -> [__m256d; 2] {
     assert!(face <= 2, "six faces");
-    // SAFETY: a kernel says that the CPU has AVX2. The loads read `numbers[face..face + 4]`.
+    // SAFETY: the caller says that the CPU has AVX2. The loads read `numbers[face..face + 4]`.
     unsafe {
         let dot = |[ax, ay, az]: [__m256d; 3], [bx, by, bz]: [__m256d; 3]| {
             let sum = _mm256_add_pd(_mm256_mul_pd(ax, bx), _mm256_mul_pd(ay, by));
@@ -99,20 +98,23 @@ fn cross_four(
 }
 
 /// What [`cross_box`] finds, four faces at a time; two of them twice.
+///
+/// # Safety
+///
+/// The CPU has AVX2.
 #[inline(always)]
-pub(super) fn cross_box_with_avx2(
-    kernel: Avx2Boxes,
+pub(super) unsafe fn cross_box_with_avx2(
     ray: &Ray,
     left_at: f64,
     planes: &BoxPlanes,
 ) -> ([f64; 2], f64) {
-    // SAFETY: a kernel says that the CPU has AVX2.
+    // SAFETY: the caller says that the CPU has AVX2.
     unsafe {
         let infinity = _mm256_set1_pd(f64::INFINITY);
         let none = _mm256_set1_pd(f64::NEG_INFINITY);
         let (mut enter, mut leave, mut least) = (none, infinity, infinity);
         for face in [0, 2] {
-            let [t, along] = cross_four(kernel, (ray, left_at), planes, face);
+            let [t, along] = cross_four((ray, left_at), planes, face);
             let inward = _mm256_cmp_pd::<_CMP_LT_OQ>(along, _mm256_setzero_pd());
             let outward = _mm256_cmp_pd::<_CMP_GT_OQ>(along, _mm256_setzero_pd());
             enter = _mm256_max_pd(enter, _mm256_blendv_pd(none, t, inward));
@@ -130,9 +132,12 @@ pub(super) fn cross_box_with_avx2(
 }
 
 /// What `PlaneCrossings::face` finds.
+///
+/// # Safety
+///
+/// The CPU has AVX2.
 #[inline(always)]
-pub(super) fn face_at_with_avx2(
-    kernel: Avx2Boxes,
+pub(super) unsafe fn face_at_with_avx2(
     rays: (&Ray, f64),
     planes: &BoxPlanes,
     t: f64,
@@ -140,9 +145,9 @@ pub(super) fn face_at_with_avx2(
 ) -> u32 {
     let mut faces = 0;
     for face in [0, 2] {
-        let [crossings, along] = cross_four(kernel, rays, planes, face);
-        // SAFETY: a kernel says that the CPU has AVX2.
+        // SAFETY: the caller says that the CPU has AVX2.
         let [there, inward] = unsafe {
+            let [crossings, along] = cross_four(rays, planes, face);
             let is_there = _mm256_cmp_pd::<_CMP_EQ_OQ>(crossings, _mm256_set1_pd(t));
             let is_inward = _mm256_cmp_pd::<_CMP_LT_OQ>(along, _mm256_setzero_pd());
             [_mm256_movemask_pd(is_there), _mm256_movemask_pd(is_inward)]
