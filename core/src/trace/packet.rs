@@ -129,8 +129,7 @@ impl Packet {
     ) {
         self.alive = u64::MAX >> (MOST_RAYS - members.len());
         self.turn = Turn::new(&rays[usize::from(members[0])], frame);
-        let mut spans = [[Span::NONE; 3]; 3];
-        let mut most = [f32::NEG_INFINITY; LANES];
+        let count = members.len().div_ceil(LANES);
         for (group, members) in self.groups.iter_mut().zip(members.chunks(LANES)) {
             // Lanes without a ray have the last one.
             let last = members.len() - 1;
@@ -139,24 +138,27 @@ impl Packet {
                 *of_lane = &rays[usize::from(member)];
             }
             kernel.fill(group, of_lanes, &self.turn);
-            for (axis, spans) in spans.iter_mut().enumerate() {
+        }
+        let groups = &self.groups[..count];
+        let mut most = [f32::NEG_INFINITY; LANES];
+        groups.iter().for_each(|group| take_most(&mut most, &group.high));
+        self.beam.high = most.into_iter().fold(f32::NEG_INFINITY, larger);
+        for axis in 0..3 {
+            let mut spans = [Span::NONE; 3];
+            for group in groups {
                 spans[0].take(&group.near_origin[axis]);
                 spans[1].take(&group.far_origin[axis]);
                 spans[2].take(&group.inverse[axis]);
             }
-            take_most(&mut most, &group.high);
-        }
-        self.beam.high = most.into_iter().fold(f32::NEG_INFINITY, larger);
-        for (axis, spans) in spans.iter().enumerate() {
             let forward = self.turn.is_forward[axis];
             (self.beam.near[axis], self.beam.far[axis]) =
                 if forward { (axis, axis + 3) } else { (axis + 3, axis) };
-            let [near_origin, far_origin, inverse] = spans;
-            self.beam.near_origin[axis] = near_origin.ends()[usize::from(forward)];
-            self.beam.far_origin[axis] = far_origin.ends()[usize::from(!forward)];
-            self.beam.inverse[axis] = inverse.ends();
+            let [near_origin, far_origin, inverse] = spans.map(|span| span.ends());
+            self.beam.near_origin[axis] = near_origin[usize::from(forward)];
+            self.beam.far_origin[axis] = far_origin[usize::from(!forward)];
+            self.beam.inverse[axis] = inverse;
             // Rounding keeps order.
-            self.beam.far_inverse[axis] = self.beam.inverse[axis].map(|inverse| inverse * FAR);
+            self.beam.far_inverse[axis] = inverse.map(|inverse| inverse * FAR);
         }
     }
 
