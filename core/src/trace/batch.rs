@@ -8,10 +8,7 @@ use std::ops::ControlFlow;
 use super::{
     box_ray::BoxRay,
     boxes::{BoxKernel, KernelWork},
-    hit::{
-        Nearest, between, is_between, is_quadrangle_between, take_crossing, take_quadrangle,
-        take_sphere,
-    },
+    hit::{Nearest, between, is_between, take_crossing, take_quadrangle, take_sphere},
     kernels::run_with_kernel,
     lanes::{CLASSES, MOST_RAYS},
     packet::{Meeting, Packet, PacketStack, visit_packet},
@@ -229,14 +226,9 @@ impl<K: BoxKernel> Meeting for NearestOfPacket<'_, K> {
     }
 
     #[inline(always)]
-    fn cross_quadrangle(&mut self, place: usize, item: Item) -> Step {
-        let member = usize::from(self.members[place]);
-        let hit = &mut self.hits[member];
-        if take_quadrangle(self.view, &self.rays[member], item, hit) {
-            Step::On(hit.t)
-        } else {
-            Step::Past
-        }
+    fn cross_quadrangle(&mut self, place: usize, item: Item, t: f64) -> Step {
+        let hit = &mut self.hits[usize::from(self.members[place])];
+        if take_quadrangle(self.view, item, t, hit) { Step::On(hit.t) } else { Step::Past }
     }
 
     #[inline(always)]
@@ -375,9 +367,9 @@ impl<K: BoxKernel> Meeting for BlockedOfPacket<'_, K> {
     }
 
     #[inline(always)]
-    fn cross_quadrangle(&mut self, place: usize, item: Item) -> Step {
-        let ray = &self.rays[usize::from(self.members[place])];
-        self.block(place, item, usize::from(is_quadrangle_between(self.view, ray, item)))
+    fn cross_quadrangle(&mut self, place: usize, item: Item, t: f64) -> Step {
+        let reach = self.rays[usize::from(self.members[place])].reach;
+        self.block(place, item, usize::from(t < reach))
     }
 
     #[inline(always)]

@@ -44,6 +44,12 @@ pub(super) trait BoxKernel: Copy {
         lanes::fill(group, rays, turn);
     }
 
+    /// The beam of all rays of some groups, which go forward on these axes.
+    #[inline(always)]
+    fn surround(self, groups: &[RayGroup], is_forward: [bool; 3]) -> Beam {
+        lanes::surround(groups, is_forward)
+    }
+
     /// Which rays of a mask meet the box between three near and three far planes, as
     /// [`BoxKernel::test`] tells it for each.
     #[inline(always)]

@@ -78,6 +78,11 @@ impl BoxKernel for Avx512Boxes {
     }
 
     #[inline(always)]
+    fn surround(self, groups: &[RayGroup], is_forward: [bool; 3]) -> Beam {
+        self.0.surround(groups, is_forward)
+    }
+
+    #[inline(always)]
     fn enter(self, groups: &[RayGroup; GROUPS], planes: [[f32; 3]; 2], mask: u64) -> u64 {
         self.0.enter(groups, planes, mask)
     }

@@ -2,8 +2,9 @@
 
 use std::arch::x86_64::{
     __m256, __m256d, _CMP_EQ_OQ, _CMP_GE_OQ, _CMP_GT_OQ, _CMP_LE_OQ, _CMP_LT_OQ, _mm_cmple_ps,
-    _mm_loadu_ps, _mm_max_ps, _mm_min_ps, _mm_movemask_ps, _mm_mul_ps, _mm_set1_ps, _mm_storeu_ps,
-    _mm_sub_ps, _mm256_add_epi32, _mm256_add_pd, _mm256_and_pd, _mm256_and_si256, _mm256_andnot_pd,
+    _mm_cvtss_f32, _mm_loadu_ps, _mm_max_ps, _mm_max_ss, _mm_min_ps, _mm_min_ss, _mm_movehdup_ps,
+    _mm_movehl_ps, _mm_movemask_ps, _mm_mul_ps, _mm_set1_ps, _mm_storeu_ps, _mm_sub_ps,
+    _mm256_add_epi32, _mm256_add_pd, _mm256_and_pd, _mm256_and_si256, _mm256_andnot_pd,
     _mm256_blendv_pd, _mm256_castpd_ps, _mm256_castpd_si256, _mm256_castps_si256,
     _mm256_castps256_ps128, _mm256_castsi256_pd, _mm256_castsi256_ps, _mm256_cmp_pd, _mm256_cmp_ps,
     _mm256_cvtpd_ps, _mm256_cvtps_pd, _mm256_div_pd, _mm256_extractf128_ps, _mm256_load_pd,
@@ -244,6 +245,41 @@ impl BoxKernel for Avx2Boxes {
     }
 
     #[inline(always)]
+    fn surround(self, groups: &[RayGroup], is_forward: [bool; 3]) -> Beam {
+        let mut beam = Beam::EMPTY;
+        // SAFETY: a value of this type says that the CPU has AVX2. The loads, aligned as the groups
+        // are, read arrays of exactly 8 floats.
+        unsafe {
+            let [least, greatest] = [f32::INFINITY, f32::NEG_INFINITY].map(|x| _mm256_set1_ps(x));
+            let mut high = greatest;
+            for group in groups {
+                high = _mm256_max_ps(_mm256_load_ps(group.high.as_ptr()), high);
+            }
+            beam.high = self.greatest(high);
+            for (axis, forward) in is_forward.into_iter().enumerate() {
+                let load = |lanes: &[[f32; LANES]; 3]| _mm256_load_ps(lanes[axis].as_ptr());
+                let mut inverses = [least, greatest];
+                // The greatest near start and the least far one, or the other way round.
+                let mut starts = [greatest, least];
+                for group in groups {
+                    let inverse = load(&group.inverse);
+                    inverses[0] = _mm256_min_ps(inverse, inverses[0]);
+                    inverses[1] = _mm256_max_ps(inverse, inverses[1]);
+                    let (near, far) = (load(&group.near_origin), load(&group.far_origin));
+                    let (upper, lower) = if forward { (near, far) } else { (far, near) };
+                    starts[0] = _mm256_max_ps(upper, starts[0]);
+                    starts[1] = _mm256_min_ps(lower, starts[1]);
+                }
+                let [upper, lower] = [self.greatest(starts[0]), self.least(starts[1])];
+                let starts = if forward { [upper, lower] } else { [lower, upper] };
+                let inverses = [self.least(inverses[0]), self.greatest(inverses[1])];
+                beam.set_axis((axis, forward), starts, inverses);
+            }
+        }
+        beam
+    }
+
+    #[inline(always)]
     fn enter(self, groups: &[RayGroup; GROUPS], [near, far]: [[f32; 3]; 2], mask: u64) -> u64 {
         let mut met = 0;
         // SAFETY: a value of this type says that the CPU has AVX2. The loads read arrays of
@@ -397,6 +433,32 @@ impl Avx2Boxes {
                 numbers[half + 3] = _mm256_permute2f128_pd::<0x31>(odd, later_odd);
             }
             numbers
+        }
+    }
+
+    /// The least of eight numbers.
+    #[inline(always)]
+    fn least(self, numbers: __m256) -> f32 {
+        // SAFETY: a value of this type says that the CPU has AVX2.
+        unsafe {
+            let (low, high) =
+                (_mm256_castps256_ps128(numbers), _mm256_extractf128_ps::<1>(numbers));
+            let four = _mm_min_ps(low, high);
+            let two = _mm_min_ps(four, _mm_movehl_ps(four, four));
+            _mm_cvtss_f32(_mm_min_ss(two, _mm_movehdup_ps(two)))
+        }
+    }
+
+    /// The greatest of eight numbers.
+    #[inline(always)]
+    fn greatest(self, numbers: __m256) -> f32 {
+        // SAFETY: a value of this type says that the CPU has AVX2.
+        unsafe {
+            let (low, high) =
+                (_mm256_castps256_ps128(numbers), _mm256_extractf128_ps::<1>(numbers));
+            let four = _mm_max_ps(low, high);
+            let two = _mm_max_ps(four, _mm_movehl_ps(four, four));
+            _mm_cvtss_f32(_mm_max_ss(two, _mm_movehdup_ps(two)))
         }
     }
 

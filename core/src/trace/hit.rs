@@ -69,19 +69,18 @@ pub(super) fn take_crossing(view: &View<'_>, ray: &Ray, item: Item, t: f64, hit:
     meet_triangle(view, ray, item, t).is_some_and(|met| take(hit, item, met))
 }
 
-/// A ray's line crosses a sphere that the ray does not leave; whether that is its nearest hit until
-/// now.
+/// A ray's line crosses a sphere at two distances, other than its start; whether that is its nearest
+/// hit until now.
 #[inline(always)]
 pub(super) fn take_sphere(view: &View<'_>, item: Item, ends: [f64; 2], hit: &mut Hit) -> bool {
     let t = first_end(ends);
     t > 0.0 && take(hit, item, (t, view.spheres[item.index()].rank, Part::WHOLE))
 }
 
-/// A ray passes inside a quadrangle, before or behind its start; whether that is its nearest hit until
-/// now.
+/// A ray meets a quadrangle at a distance above 0; whether that is its nearest hit until now.
 #[inline(always)]
-pub(super) fn take_quadrangle(view: &View<'_>, ray: &Ray, item: Item, hit: &mut Hit) -> bool {
-    meet_quadrangle(view, ray, item).is_some_and(|met| take(hit, item, met))
+pub(super) fn take_quadrangle(view: &View<'_>, item: Item, t: f64, hit: &mut Hit) -> bool {
+    take(hit, item, (t, view.quadrangles[item.index()].rank, Part::WHOLE))
 }
 
 /// The distance at which the ray crosses a face other than the one that it leaves, the face's rank,
@@ -184,12 +183,6 @@ pub(super) fn is_between(
 ) -> bool {
     (ending_on.is_empty() || !ending_on.contains(&Face::whole(item).surface(view)))
         && meet_triangle(view, ray, item, t).is_some_and(|(t, ..)| t < ray.reach)
-}
-
-/// The same for a quadrangle that no such surface contains and inside which the ray passes.
-#[inline(always)]
-pub(super) fn is_quadrangle_between(view: &View<'_>, ray: &Ray, item: Item) -> bool {
-    meet_quadrangle(view, ray, item).is_some_and(|(t, ..)| t < ray.reach)
 }
 
 /// The crossings of a solid up to `reach`, which `take` is told of.

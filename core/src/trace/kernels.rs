@@ -209,6 +209,7 @@ mod tests {
         distances: Vec<Option<u64>>,
         classes: Vec<u64>,
         filled: Option<String>,
+        beam: String,
     }
 
     impl KernelWork<Group> for Option<FoundByGroup> {
@@ -233,8 +234,19 @@ mod tests {
                 kernel.fill(&mut filled, rays.each_ref(), &packet.turn);
                 format!("{filled:?}")
             });
-            *self =
-                Some(FoundByGroup { entering, met, nears, crossings, distances, classes, filled });
+            let count = group.rays.len().div_ceil(LANES);
+            let beam = kernel.surround(&packet.groups[..count], packet.turn.is_forward);
+            let beam = format!("{beam:?}");
+            *self = Some(FoundByGroup {
+                entering,
+                met,
+                nears,
+                crossings,
+                distances,
+                classes,
+                filled,
+                beam,
+            });
         }
     }
 

@@ -1,7 +1,10 @@
 //! Spheres and quadrangles before a group of rays: loops over lanes in plain Rust, which are compiled
 //! for each instruction set. Every lane computes what the ray alone does, in the same order.
 
-use super::lanes::{LANES, RayGroup};
+use super::{
+    lanes::{LANES, RayGroup},
+    triangle::EDGE_ON,
+};
 
 /// Where the lines of a group's rays cross a sphere.
 pub(super) struct SphereEnds {
@@ -62,14 +65,37 @@ pub(super) fn cross_sphere(
     ends
 }
 
-/// The rays of a group that leave a surface, a bit each.
+/// `hit_sphere_again` for a group whose starts have these axes.
 #[inline(always)]
-pub(super) fn leaves(group: &RayGroup, surface: u32) -> u64 {
-    let mut leaves = 0;
+pub(super) fn cross_sphere_again(
+    group: &RayGroup,
+    axes: [usize; 3],
+    center: &[f64; 3],
+) -> [f64; LANES] {
+    let mut products = [[0.0; LANES]; 3];
+    for (axis, starts) in axes.into_iter().zip(&group.origin) {
+        let axis = axis % 3;
+        for lane in 0..LANES {
+            products[axis][lane] = (starts[lane] - center[axis]) * group.direction[axis][lane];
+        }
+    }
+    let mut again = [0.0; LANES];
+    for (lane, again) in again.iter_mut().enumerate() {
+        *again = -2.0 * (products[0][lane] + products[1][lane] + products[2][lane]);
+    }
+    again
+}
+
+/// The rays of a group that leave a surface, a bit each; and those of them that still have the face of
+/// this rank on it ahead of them.
+#[inline(always)]
+pub(super) fn leaves(group: &RayGroup, surface: u32, rank: u32) -> (u64, u64) {
+    let (mut leaves, mut ahead) = (0, 0);
     for (lane, &leaving) in group.leaving.iter().enumerate() {
         leaves |= u64::from(leaving as u32 == surface) << lane;
+        ahead |= u64::from((leaving >> 32) < u64::from(rank)) << lane;
     }
-    leaves
+    (leaves, leaves & ahead)
 }
 
 /// `is_inside` for a group of rays and a quadrangle with its corners in the order of the rays' axes:
@@ -96,4 +122,30 @@ pub(super) fn pass_quadrangle(group: &RayGroup, corners: &[[f64; 3]; 4]) -> (u64
         }
     }
     (inside, in_doubt)
+}
+
+/// `hit_plane` for a group whose starts have these axes: the rays that do not as good as run along the
+/// plane, a bit each, and their distances from it.
+#[inline(always)]
+pub(super) fn cross_plane(
+    group: &RayGroup,
+    axes: [usize; 3],
+    [point, normal]: [&[f64; 3]; 2],
+) -> (u64, [f64; LANES]) {
+    let [mut distance, mut along] = [[[0.0; LANES]; 3]; 2];
+    for (axis, starts) in axes.into_iter().zip(&group.origin) {
+        let axis = axis % 3;
+        for lane in 0..LANES {
+            distance[axis][lane] = normal[axis] * (point[axis] - starts[lane]);
+            along[axis][lane] = normal[axis] * group.direction[axis][lane];
+        }
+    }
+    let (mut crosses, mut t) = (0, [0.0; LANES]);
+    for lane in 0..LANES {
+        let [x, y, z] = [distance[0][lane], distance[1][lane], distance[2][lane]];
+        let along = along[0][lane] + along[1][lane] + along[2][lane];
+        t[lane] = (x + y + z) / along;
+        crosses |= u64::from(along.abs() > EDGE_ON) << lane;
+    }
+    (crosses, t)
 }

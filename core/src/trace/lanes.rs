@@ -108,6 +108,22 @@ impl Beam {
         far_inverse: [[0.0; 2]; 3],
         high: 0.0,
     };
+
+    /// Takes in what its rays have on an axis, on which they go forward or not.
+    #[inline(always)]
+    pub(super) fn set_axis(
+        &mut self,
+        (axis, forward): (usize, bool),
+        [near_origin, far_origin]: [f32; 2],
+        inverse: [f32; 2],
+    ) {
+        (self.near[axis], self.far[axis]) =
+            if forward { (axis, axis + 3) } else { (axis + 3, axis) };
+        (self.near_origin[axis], self.far_origin[axis]) = (near_origin, far_origin);
+        // Rounding keeps order.
+        let [least, greatest] = inverse;
+        (self.inverse[axis], self.far_inverse[axis]) = (inverse, [least * FAR, greatest * FAR]);
+    }
 }
 
 /// What rays are to a triangle, a bit each.
@@ -184,6 +200,40 @@ pub(super) fn fill(group: &mut RayGroup, rays: [&Ray; LANES], turn: &Turn) {
         group.slopes[2][lane] = 1.0 / z;
         group.high[lane] = turn.reach.reach(ray.reach);
     }
+}
+
+/// Which end of an interval is wanted: the least or the greatest number.
+#[inline(always)]
+fn end_of<'a>(rows: impl Iterator<Item = &'a [f32; LANES]>, is_greatest: bool) -> f32 {
+    let (start, keep): (_, fn(f32, f32) -> f32) =
+        if is_greatest { (f32::NEG_INFINITY, larger) } else { (f32::INFINITY, smaller) };
+    let mut ends = [start; LANES];
+    for row in rows {
+        for (end, &x) in ends.iter_mut().zip(row) {
+            *end = keep(x, *end);
+        }
+    }
+    // As instructions that halve a vector have it.
+    let [a, b, c, d, e, f, g, h] = ends;
+    keep(keep(keep(a, e), keep(c, g)), keep(keep(b, f), keep(d, h)))
+}
+
+/// `BoxKernel::surround` in plain Rust.
+#[inline(always)]
+pub(super) fn surround(groups: &[RayGroup], is_forward: [bool; 3]) -> Beam {
+    let mut beam = Beam::EMPTY;
+    beam.high = end_of(groups.iter().map(|group| &group.high), true);
+    for (axis, forward) in is_forward.into_iter().enumerate() {
+        let inverses = || groups.iter().map(|group| &group.inverse[axis]);
+        let near_origins = groups.iter().map(|group| &group.near_origin[axis]);
+        let far_origins = groups.iter().map(|group| &group.far_origin[axis]);
+        beam.set_axis(
+            (axis, forward),
+            [end_of(near_origins, forward), end_of(far_origins, !forward)],
+            [end_of(inverses(), false), end_of(inverses(), true)],
+        );
+    }
+    beam
 }
 
 /// `BoxKernel::enter` in plain Rust.

@@ -10,10 +10,10 @@
 //! on the Intel MIC Architecture" (2012).
 
 use super::{
-    box_ray::{BoxRay, FAR},
+    box_ray::BoxRay,
     boxes::BoxKernel,
-    lane_faces::{cross_sphere, leaves, pass_quadrangle},
-    lanes::{Beam, GROUPS, LANES, MOST_RAYS, RayGroup, Turn, larger, shear_at, smaller},
+    lane_faces::{cross_plane, cross_sphere, cross_sphere_again, leaves, pass_quadrangle},
+    lanes::{Beam, GROUPS, LANES, MOST_RAYS, RayGroup, Turn, larger, shear_at},
     ray::{Ray, Shear},
     traversal::{STACK, Stack, Step, visit_from},
 };
@@ -48,37 +48,6 @@ impl Default for PacketStack {
     }
 }
 
-/// Keeps the greater number of each lane.
-#[inline(always)]
-fn take_most(most: &mut [f32; LANES], lanes: &[f32; LANES]) {
-    for (most, &x) in most.iter_mut().zip(lanes) {
-        *most = larger(x, *most);
-    }
-}
-
-/// The least and the greatest number of each lane.
-#[derive(Clone, Copy)]
-struct Span([[f32; LANES]; 2]);
-
-impl Span {
-    const NONE: Self = Self([[f32::INFINITY; LANES], [f32::NEG_INFINITY; LANES]]);
-
-    #[inline(always)]
-    fn take(&mut self, lanes: &[f32; LANES]) {
-        let [least, most] = &mut self.0;
-        for (least, &x) in least.iter_mut().zip(lanes) {
-            *least = smaller(x, *least);
-        }
-        take_most(most, lanes);
-    }
-
-    #[inline(always)]
-    fn ends(&self) -> [f32; 2] {
-        let [least, most] = self.0;
-        [least.into_iter().fold(least[0], smaller), most.into_iter().fold(most[0], larger)]
-    }
-}
-
 /// What is done with what rays of a packet meet.
 pub(super) trait Meeting {
     /// The ray at a place in the packet crosses a triangle at a distance, before or behind its start.
@@ -88,12 +57,12 @@ pub(super) trait Meeting {
     /// [`Meeting::cross_quadrangle`] have it; else it is asked.
     fn is_plain(&self, item: Item) -> bool;
 
-    /// The line of a ray that does not leave this sphere crosses it at two distances, the nearer one
-    /// first.
+    /// The line of a ray crosses this sphere at two distances, the nearer one first, other than its
+    /// start if it leaves the sphere; infinite where there is none.
     fn cross_sphere(&mut self, place: usize, item: Item, ends: [f64; 2]) -> Step;
 
-    /// The ray passes inside a quadrangle, before or behind its start.
-    fn cross_quadrangle(&mut self, place: usize, item: Item) -> Step;
+    /// The ray's line crosses a quadrangle that the ray does not leave, at a distance above 0.
+    fn cross_quadrangle(&mut self, place: usize, item: Item, t: f64) -> Step;
 
     /// The ray may meet an item.
     fn ask(&mut self, place: usize, item: Item, shear: &Shear, box_ray: &BoxRay) -> Step;
@@ -139,27 +108,7 @@ impl Packet {
             }
             kernel.fill(group, of_lanes, &self.turn);
         }
-        let groups = &self.groups[..count];
-        let mut most = [f32::NEG_INFINITY; LANES];
-        groups.iter().for_each(|group| take_most(&mut most, &group.high));
-        self.beam.high = most.into_iter().fold(f32::NEG_INFINITY, larger);
-        for axis in 0..3 {
-            let mut spans = [Span::NONE; 3];
-            for group in groups {
-                spans[0].take(&group.near_origin[axis]);
-                spans[1].take(&group.far_origin[axis]);
-                spans[2].take(&group.inverse[axis]);
-            }
-            let forward = self.turn.is_forward[axis];
-            (self.beam.near[axis], self.beam.far[axis]) =
-                if forward { (axis, axis + 3) } else { (axis + 3, axis) };
-            let [near_origin, far_origin, inverse] = spans.map(|span| span.ends());
-            self.beam.near_origin[axis] = near_origin[usize::from(forward)];
-            self.beam.far_origin[axis] = far_origin[usize::from(!forward)];
-            self.beam.inverse[axis] = inverse;
-            // Rounding keeps order.
-            self.beam.far_inverse[axis] = inverse.map(|inverse| inverse * FAR);
-        }
+        self.beam = kernel.surround(&self.groups[..count], self.turn.is_forward);
     }
 
     /// A ray as boxes want it.
@@ -203,7 +152,9 @@ impl Packet {
         let mut most = [f32::NEG_INFINITY; LANES];
         for (k, group) in self.groups.iter().enumerate() {
             if self.alive >> (LANES * k) & 0xFF != 0 {
-                take_most(&mut most, &group.high);
+                for (most, &high) in most.iter_mut().zip(&group.high) {
+                    *most = larger(high, *most);
+                }
             }
         }
         self.beam.high = most.into_iter().fold(f32::NEG_INFINITY, larger);
@@ -276,15 +227,29 @@ impl Packet {
         let mut is_changed = false;
         for (k, asking) in groups(mask) {
             let group = &self.groups[k];
-            let ends = cross_sphere(group, self.turn.axes, &sphere.center, sphere.radius);
-            let leaves = leaves(group, sphere.surface);
-            for lane in lanes(asking & (ends.met | leaves)) {
+            let (leaves, ahead) = leaves(group, sphere.surface, sphere.rank);
+            let asked = asking & ahead;
+            if asking & leaves & !ahead != 0 {
+                let again = cross_sphere_again(group, self.turn.axes, &sphere.center);
+                for lane in lanes(asking & leaves & !ahead) {
+                    let step =
+                        meeting.cross_sphere(LANES * k + lane, item, [again[lane], f64::INFINITY]);
+                    is_changed |= self.take(LANES * k + lane, &step);
+                }
+            }
+            for lane in lanes(asked) {
                 let place = LANES * k + lane;
-                let step = if leaves >> lane & 1 == 1 {
-                    meeting.ask(place, item, &self.shear(place), &BoxRay::NOWHERE)
-                } else {
-                    meeting.cross_sphere(place, item, [ends.near[lane], ends.far[lane]])
-                };
+                let step = meeting.ask(place, item, &self.shear(place), &BoxRay::NOWHERE);
+                is_changed |= self.take(place, &step);
+            }
+            if asking & !leaves == 0 {
+                continue;
+            }
+            let group = &self.groups[k];
+            let ends = cross_sphere(group, self.turn.axes, &sphere.center, sphere.radius);
+            for lane in lanes(asking & !leaves & ends.met) {
+                let place = LANES * k + lane;
+                let step = meeting.cross_sphere(place, item, [ends.near[lane], ends.far[lane]]);
                 is_changed |= self.take(place, &step);
             }
         }
@@ -307,13 +272,27 @@ impl Packet {
         }
         let mut is_changed = false;
         for (k, asking) in groups(mask) {
-            let (inside, in_doubt) = pass_quadrangle(&self.groups[k], &corners);
+            let group = &self.groups[k];
+            let (leaves, ahead) = leaves(group, face.plane.surface().0, face.rank);
+            let asking = asking & !(leaves & !ahead);
+            if asking == 0 {
+                continue;
+            }
+            let (inside, in_doubt) = pass_quadrangle(group, &corners);
+            if asking & (inside | in_doubt) == 0 {
+                continue;
+            }
+            let plane = &view.planes[face.plane.index()];
+            let (crosses, t) = cross_plane(group, self.turn.axes, [&plane.point, &plane.normal]);
+            let asked = in_doubt | leaves | !crosses;
             for lane in lanes(asking & (inside | in_doubt)) {
                 let place = LANES * k + lane;
-                let step = if in_doubt >> lane & 1 == 1 {
+                let step = if asked >> lane & 1 == 1 {
                     meeting.ask(place, item, &self.shear(place), &BoxRay::NOWHERE)
+                } else if t[lane] > 0.0 {
+                    meeting.cross_quadrangle(place, item, t[lane])
                 } else {
-                    meeting.cross_quadrangle(place, item)
+                    Step::Past
                 };
                 is_changed |= self.take(place, &step);
             }
