@@ -49,6 +49,9 @@ const VERSION: &str = env!("CARGO_PKG_VERSION");
 /// Of the sources that pixels depend on, which coordinator and workers must share; see `build.rs`.
 const BUILD: &str = env!("RTFARM_BUILD");
 
+#[global_allocator]
+static ALLOCATOR: memory::LargePages = memory::LargePages;
+
 fn main() -> ExitCode {
     memory::return_what_is_freed();
     let args = match Args::try_parse() {
