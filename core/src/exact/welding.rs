@@ -1,6 +1,7 @@
 //! Points in one place become one.
 
 use hashbrown::{HashTable, hash_table::Entry};
+use rayon::prelude::*;
 
 use super::hash::HashFunction;
 
@@ -54,7 +55,7 @@ impl PointTable {
 
     /// Does the same for a point whose hash by the table's hasher is known.
     #[inline(always)]
-    pub(crate) fn entry_with_hash(
+    fn entry_with_hash(
         &mut self,
         hash: u64,
         point: PointBits,
@@ -62,5 +63,57 @@ impl PointTable {
     ) -> Entry<'_, u32> {
         let Self { firsts, hasher } = self;
         firsts.entry(hash, |&index| point_at(index) == point, |&index| hasher.hash(point_at(index)))
+    }
+}
+
+/// For every point, the first point in the same place, on rayon's threads.
+pub(crate) fn find_firsts<P: Sync>(points: &[P], bits_of: fn(&P) -> PointBits) -> Vec<u32> {
+    // Each thread keeps the points of one share of all hashes; a point's share depends on its
+    // coordinates alone, so the answer does not depend on the number of shares.
+    let shares = if points.len() < 1 << 14 { 1 } else { rayon::current_num_threads() };
+    let hasher = PointHasher::new();
+    let hashes: Vec<u64> = points.par_iter().map(|point| hasher.hash(bits_of(point))).collect();
+    let copies: Vec<Vec<(u32, u32)>> = (0..shares)
+        .into_par_iter()
+        .map(|share| {
+            let mut table = PointTable::new(hasher.clone(), points.len() / shares);
+            let mut copies = Vec::new();
+            for (point, &hash) in (0_u32..).zip(&hashes) {
+                if (hash >> 32) as usize % shares != share {
+                    continue;
+                }
+                let bits_at = |point: u32| bits_of(&points[point as usize]);
+                match table.entry_with_hash(hash, bits_at(point), bits_at) {
+                    Entry::Occupied(first) => copies.push((point, *first.get())),
+                    Entry::Vacant(place) => {
+                        place.insert(point);
+                    }
+                }
+            }
+            copies
+        })
+        .collect();
+    let mut firsts: Vec<u32> = (0..points.len() as u32).collect();
+    for (copy, first) in copies.into_iter().flatten() {
+        firsts[copy as usize] = first;
+    }
+    firsts
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn equal_points_get_the_first_ones_number() {
+        let points: Vec<PointBits> = (0..100_000).map(|k| [k % 1000, k % 7, 1]).collect();
+        for threads in [1, 2, 5] {
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+            let firsts = pool.install(|| find_firsts(&points, |&point| point));
+            for (point, &first) in firsts.iter().enumerate() {
+                assert_eq!(points[point], points[first as usize]);
+                assert_eq!(first as usize, point % 7000);
+            }
+        }
     }
 }

@@ -10,7 +10,7 @@ use crate::{
     exact::{
         polygon,
         predicates::is_collinear,
-        welding::{PointHasher, PointTable},
+        welding::{PointHasher, PointTable, find_firsts},
     },
     scene::{DroppedFaces, MeshShape, MeshVertices},
 };
@@ -96,6 +96,28 @@ impl<T: Copy + Into<f64>> MeshBuilder<T> {
                 dropped: DroppedFaces::default(),
             },
         }
+    }
+
+    /// Adds the vertices of a file that gives all of them before its faces, finite and without negative
+    /// zeros, to an empty mesh: the index of each.
+    pub(super) fn add_vertices(&mut self, positions: &[[T; 3]]) -> Result<Vec<u32>, MeshFault>
+    where
+        T: Sync,
+    {
+        u32::try_from(positions.len()).map_err(|_| MeshFault::TooLarge)?;
+        let bits_of = |position: &[T; 3]| position.map(|number| number.into().to_bits());
+        let mut numbers = find_firsts(positions, bits_of);
+        self.vertices.reserve(positions.len());
+        for k in 0..numbers.len() {
+            let first = numbers[k] as usize;
+            numbers[k] = if first == k {
+                self.vertices.push(positions[k]);
+                self.vertices.len() as u32 - 1
+            } else {
+                numbers[first]
+            };
+        }
+        Ok(numbers)
     }
 
     /// Finds or adds the vertex at a finite position, in which no zero is negative, and gives its

@@ -30,16 +30,14 @@ fn read_in_pieces(text: &[u8], size: usize) -> Option<MeshFile> {
     }
     let of_pieces: Vec<Vec<[f64; 3]>> =
         pieces.par_iter().map(|piece| read_positions(piece)).collect::<Option<_>>()?;
-    let count = of_pieces.iter().map(Vec::len).sum();
-    let mut mesh = MeshBuilder::<f64>::with_capacity(count, 0);
-    let mut vertices = Vec::with_capacity(count);
+    let mut count = 0;
     let mut firsts = Vec::with_capacity(pieces.len());
-    for positions in of_pieces {
-        firsts.push(vertices.len());
-        for position in positions {
-            vertices.push(mesh.add_vertex(position).ok()?);
-        }
+    for positions in &of_pieces {
+        firsts.push(count);
+        count += positions.len();
     }
+    let mut mesh = MeshBuilder::<f64>::with_capacity(0, 0);
+    let vertices = mesh.add_vertices(&of_pieces.concat()).ok()?;
     let faces: Vec<MeshFaces> = (pieces.par_iter().zip(firsts))
         .map(|(piece, first)| read_faces(piece, first, &vertices, mesh.vertices()))
         .collect::<Option<_>>()?;
