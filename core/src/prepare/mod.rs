@@ -88,10 +88,9 @@ pub fn prepare_with(
         Lighting { background: scene.background.to_array(), ambient: ambient.to_array() };
     let sections = Sections {
         nodes: &nodes,
-        items: &faces.items,
+        faces: &faces.faces,
         vertices: &faces.vertices,
-        triangles: &faces.triangles,
-        coplanars: &faces.coplanars,
+        coats: &faces.coats,
         quadrangles: &faces.quadrangles,
         spheres: &faces.spheres,
         planes: &faces.planes,

@@ -26,27 +26,23 @@ pub(super) fn check(view: &View<'_>) -> Result<(), &'static str> {
     ensure(is_scale(header.scale) && is_scale(header.frame.scale), "a scale")?;
     ensure(finite(&header.frame.origin), "the frame")?;
 
-    check_hierarchies(view.nodes, [(Node::ROOT, view.items.len())])?;
-    for item in view.items {
-        let count = match item.kind().ok_or("an item")? {
-            Kind::Triangle => view.triangles.len(),
-            Kind::Coplanar => view.coplanars.len(),
-            Kind::Quadrangle => view.quadrangles.len(),
-            Kind::Sphere => view.spheres.len(),
-            Kind::Solid => view.solids.len(),
-        };
-        ensure(item.index() < count, "an item")?;
-    }
+    check_hierarchies(view.nodes, [(Node::ROOT, view.faces.len())])?;
     ensure(view.vertices.iter().all(|vertex| finite(vertex)), "a vertex")?;
     let vertices = |indices: &[u32]| indices.iter().all(|&k| (k as usize) < view.vertices.len());
     let material = |index: u32| (index as usize) < view.materials.len();
     let plane = |index: PlaneIndex| index.index() < view.planes.len();
-    for face in view.triangles {
-        ensure(vertices(&face.vertices) && material(face.material), "a triangle")?;
+    for (face, item) in view.faces.iter().zip(view.all_items()) {
+        let is_whole = match item.kind().ok_or("an item")? {
+            Kind::Triangle => vertices(&face.vertices) && material(face.material()),
+            Kind::Coplanar => vertices(&face.vertices) && face.coat() < view.coats.len(),
+            Kind::Quadrangle => item.index() < view.quadrangles.len(),
+            Kind::Sphere => item.index() < view.spheres.len(),
+            Kind::Solid => item.index() < view.solids.len(),
+        };
+        ensure(is_whole, "an item")?;
     }
-    for face in view.coplanars {
-        let whole = vertices(&face.vertices) && material(face.material) && plane(face.plane);
-        ensure(whole, "a triangle")?;
+    for coat in view.coats {
+        ensure(plane(coat.plane) && material(coat.material), "a coat")?;
     }
     for face in view.quadrangles {
         let whole = vertices(&face.vertices) && material(face.material) && plane(face.plane);

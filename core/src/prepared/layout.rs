@@ -1,19 +1,21 @@
 //! The order of a block: its header and its sections.
 
+use std::ops::Range;
+
 use super::{
     node::{Frame, Node},
     record::{
-        BoxPlanes, Camera, CoplanarRecord, EmitterNode, EmitterRecord, Features, Item, LeafRecord,
-        LevelRecord, LightRecord, Lighting, MaterialRecord, PlaneRecord, QuadrangleRecord,
-        SolidNodeRecord, SolidRecord, SphereRecord, Surface, TextureRecord, TexturedFace,
-        TriangleRecord,
+        BoxPlanes, Camera, Coat, EmitterNode, EmitterRecord, FaceRecord, Features, Item,
+        LeafRecord, LevelRecord, LightRecord, Lighting, MaterialRecord, PlaneRecord,
+        QuadrangleRecord, SolidNodeRecord, SolidRecord, SphereRecord, Surface, TextureRecord,
+        TexturedFace,
     },
 };
 
 pub(super) const MAGIC: [u8; 8] = *b"rtfarm\r\n";
 
 /// The version changes with the layout or the meaning of any byte.
-pub(super) const VERSION: u32 = 9;
+pub(super) const VERSION: u32 = 10;
 
 /// This number reads differently on a machine of the other byte order.
 pub(super) const BYTE_ORDER: u32 = 0x0102_0304;
@@ -75,10 +77,9 @@ macro_rules! sections {
 
 sections! {
     nodes: Node,
-    items: Item,
+    faces: FaceRecord,
     vertices: [f64; 3],
-    triangles: TriangleRecord,
-    coplanars: CoplanarRecord,
+    coats: Coat,
     quadrangles: QuadrangleRecord,
     spheres: SphereRecord,
     planes: PlaneRecord,
@@ -145,6 +146,24 @@ impl<'a> View<'a> {
             Some(primitive) => (primitive as u32, rank - self.first_ranks[primitive]),
             None => (rank, 0),
         }
+    }
+
+    /// The items of a run, such as that of a leaf.
+    #[inline(always)]
+    pub(crate) fn items(&self, run: Range<usize>) -> impl Iterator<Item = Item> + use<'a> {
+        let first = run.start;
+        self.faces[run].iter().enumerate().map(move |(k, face)| face.item(first + k))
+    }
+
+    /// All items.
+    pub(crate) fn all_items(&self) -> impl Iterator<Item = Item> + use<'a> {
+        self.items(0..self.faces.len())
+    }
+
+    /// The plane and the material of a triangle that shares its plane.
+    #[inline(always)]
+    pub(crate) fn coat(&self, face: &FaceRecord) -> &'a Coat {
+        &self.coats[face.coat()]
     }
 
     /// The positions of vertices.

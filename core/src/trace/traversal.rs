@@ -70,7 +70,7 @@ pub(super) fn visit_from(
     let mut waiting = 0;
     loop {
         if current.is_leaf() {
-            for &item in &view.items[current.items()] {
+            for item in view.items(current.items()) {
                 match meet(item, box_ray) {
                     Step::Past => {}
                     Step::On(reach) => box_ray.shorten(reach),

@@ -38,7 +38,7 @@ impl FrustumSearch {
         let frustum = Frustum::new(screen, &view.header.frame, beam);
         while let Some(child) = self.waiting.pop() {
             if child.is_leaf() {
-                for &item in &view.items[child.items()] {
+                for item in view.items(child.items()) {
                     self.outlines.add_item(view, screen, item, beam);
                 }
                 if self.outlines.as_slice().len() > most {
