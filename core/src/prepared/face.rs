@@ -134,7 +134,7 @@ impl Face {
         match self.item.kind().expect("a checked item") {
             Kind::Triangle => {
                 let corners = view.corners(&view.faces[index].vertices);
-                triangle_normal(corners.map(|&corner| DVec3::from_array(corner)))
+                triangle_normal(corners.map(DVec3::from_array))
             }
             Kind::Coplanar => of_plane(view.coat(&view.faces[index]).plane),
             Kind::Quadrangle => of_plane(view.quadrangles[index].plane),
@@ -230,7 +230,7 @@ impl Polygon {
     fn new(view: &View<'_>, vertices: &[u32]) -> Self {
         let mut corners = [DVec3::ZERO; 4];
         for (corner, &vertex) in corners.iter_mut().zip(vertices) {
-            *corner = DVec3::from_array(view.vertices[vertex as usize]);
+            *corner = DVec3::from_array(view.vertex(vertex));
         }
         Self { corners, count: vertices.len() }
     }

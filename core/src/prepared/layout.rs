@@ -3,7 +3,7 @@
 use std::ops::Range;
 
 use super::{
-    node::{Frame, Node},
+    node::{CompactNode, Frame, Node},
     record::{
         BoxPlanes, Camera, Coat, EmitterNode, EmitterRecord, FaceRecord, Features, Item,
         LeafRecord, LevelRecord, LightRecord, Lighting, MaterialRecord, PlaneRecord,
@@ -59,6 +59,10 @@ macro_rules! sections {
 
         const SECTIONS: usize = [$(stringify!($name)),*].len();
 
+        /// The names of the sections, in their order.
+        #[doc(hidden)]
+        pub const SECTION_NAMES: [&str; SECTIONS] = [$(stringify!($name)),*];
+
         /// The record sizes of the sections, in their order.
         pub(super) const RECORD_SIZES: [usize; SECTIONS] = [$(size_of::<$record>()),*];
 
@@ -77,8 +81,10 @@ macro_rules! sections {
 
 sections! {
     nodes: Node,
+    compact_nodes: CompactNode,
     faces: FaceRecord,
     vertices: [f64; 3],
+    single_vertices: [f32; 3],
     coats: Coat,
     quadrangles: QuadrangleRecord,
     spheres: SphereRecord,
@@ -166,9 +172,41 @@ impl<'a> View<'a> {
         &self.coats[face.coat()]
     }
 
-    /// The positions of vertices.
+    /// A node of the hierarchy, which is compact or not; a compact one is expanded into `room`.
     #[inline(always)]
-    pub(crate) fn corners<const N: usize>(&self, vertices: &[u32; N]) -> [&'a [f64; 3]; N] {
-        vertices.map(|vertex| &self.vertices[vertex as usize])
+    pub(crate) fn node<'n>(&self, index: usize, room: &'n mut Option<Node>) -> &'n Node
+    where
+        'a: 'n,
+    {
+        match self.sections.nodes.get(index) {
+            Some(node) => node,
+            None => room.insert(self.compact_nodes[index].expand()),
+        }
+    }
+
+    /// How many vertices there are.
+    pub(super) fn vertex_count(&self) -> usize {
+        self.vertices.len() + self.single_vertices.len()
+    }
+
+    /// The position of a vertex: those in single precision follow the others.
+    #[inline(always)]
+    pub(crate) fn vertex(&self, vertex: u32) -> [f64; 3] {
+        let index = vertex as usize;
+        if let Some(&vertex) = self.sections.vertices.get(index) {
+            return vertex;
+        }
+        let [x, y, z] = self.single_vertices[index - self.vertices.len()];
+        [f64::from(x), f64::from(y), f64::from(z)]
+    }
+
+    /// The positions of vertices. This is a loop, as `Shear::project_all` is.
+    #[inline(always)]
+    pub(crate) fn corners<const N: usize>(&self, vertices: &[u32; N]) -> [[f64; 3]; N] {
+        let mut corners = [[0.0; 3]; N];
+        for (corner, &vertex) in corners.iter_mut().zip(vertices) {
+            *corner = self.vertex(vertex);
+        }
+        corners
     }
 }

@@ -200,6 +200,12 @@ impl FaceRecord {
         )
     }
 
+    /// The vertices of a triangle, to be changed; `None` for another item.
+    pub(crate) fn triangle_vertices(&mut self) -> Option<&mut [u32; 3]> {
+        let is_triangle = self.kind_and_rank >> 29 <= Kind::Coplanar as u32;
+        is_triangle.then_some(&mut self.vertices)
+    }
+
     /// The rank of a triangle.
     #[inline(always)]
     pub(crate) fn rank(&self) -> u32 {

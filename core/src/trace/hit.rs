@@ -92,7 +92,7 @@ fn meet(view: &View<'_>, ray: &Ray, shear: &Shear, item: Item) -> Option<(f64, u
     let index = item.index();
     let (t, rank) = match item.kind()? {
         Kind::Triangle | Kind::Coplanar => {
-            let corners = shear.project_all(view.corners(&view.faces[index].vertices));
+            let corners = shear.project_all(&view.corners(&view.faces[index].vertices));
             return meet_triangle(view, ray, item, hit_triangle(corners)?);
         }
         Kind::Quadrangle => {
@@ -100,7 +100,7 @@ fn meet(view: &View<'_>, ray: &Ray, shear: &Shear, item: Item) -> Option<(f64, u
             if ray.leaving == face.plane.surface() && face.rank <= ray.after {
                 return None;
             }
-            let corners = shear.project_all(view.corners(&face.vertices));
+            let corners = shear.project_all(&view.corners(&face.vertices));
             return if is_inside(&corners) { meet_quadrangle(view, ray, item) } else { None };
         }
         Kind::Sphere => {
@@ -140,7 +140,7 @@ fn meet_quadrangle(view: &View<'_>, ray: &Ray, item: Item) -> Option<(f64, u32, 
     let [point, normal] = [plane.point, plane.normal].map(DVec3::from_array);
     let t = hit_plane(ray, point, normal).unwrap_or_else(|| {
         let shear = Shear::new(ray.origin, ray.direction);
-        hit_chord(&shear.project_all(view.corners(&face.vertices)))
+        hit_chord(&shear.project_all(&view.corners(&face.vertices)))
     });
     (t > 0.0).then_some((t, face.rank, Part::WHOLE))
 }

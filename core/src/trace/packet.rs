@@ -386,7 +386,8 @@ pub(super) fn visit_packet(
             }
             packet.shorten_beam();
         } else {
-            let node = &view.nodes[current.node()];
+            let room = &mut None;
+            let node = view.node(current.node(), room);
             let (nears, mut met) = kernel.meet_beam(node, &packet.beam);
             let first = waiting;
             while met != 0 {

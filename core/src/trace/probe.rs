@@ -62,7 +62,7 @@ impl FaceTests {
     fn add(&mut self, view: &View<'_>, shear: &Shear, item: Item) {
         let mut is_in_doubt = false;
         let index = item.index();
-        let project = |corner| shear.project(corner);
+        let project = |corner: [f64; 3]| shear.project(&corner);
         let mut test_triangle = |vertices| {
             hit_triangle_in_doubt(view.corners(vertices).map(project), &mut is_in_doubt);
         };

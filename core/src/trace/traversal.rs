@@ -79,7 +79,8 @@ pub(super) fn visit_from(
             }
         } else {
             enter();
-            let node = &view.nodes[current.node()];
+            let room = &mut None;
+            let node = view.node(current.node(), room);
             let (distances, mut mask) = kernel.test(node, box_ray);
             let first = waiting;
             while mask != 0 {

@@ -46,7 +46,8 @@ impl FrustumSearch {
                 }
                 continue;
             }
-            let node = &view.nodes[child.node()];
+            let room = &mut None;
+            let node = view.node(child.node(), room);
             let mut mask = frustum.boxes_met(&node.planes);
             while mask != 0 {
                 let child = node.children[mask.trailing_zeros() as usize & 7];
