@@ -9,7 +9,7 @@ use rtfarm_core::{
     assets::{mesh::read_mesh, texture::read_texture},
     isa::Isa,
     language::{Severity, Style, draw_diagnostics, read_scene},
-    prepare::prepare,
+    prepare::{Form, prepare_as},
     prepared::{PreparedBytes, PreparedError, PreparedScene},
     render::{Quality, Sampling, render_tile},
     scene::{MeshVertices, Scene, SolidNode},
@@ -64,7 +64,7 @@ pub(crate) fn image(data: &[u8]) {
 
 /// What a prepared scene is made from before its bytes are changed: with all kinds of faces, and
 /// light that is mirrored, bent and let through; with solids and nothing else; with one triangle;
-/// with an image.
+/// with an image. The same follow in the compact form.
 const SCENES: [&str; 4] = [
     include_str!("prepared/all.rt"),
     include_str!("prepared/solids.rt"),
@@ -77,8 +77,11 @@ const IMAGE: &[u8] = include_bytes!("corpus/image/rgb.png");
 static PREPARED: LazyLock<Vec<Vec<u8>>> = LazyLock::new(|| {
     let image = |_: &str| Ok(IMAGE.to_vec());
     let scene = |text: &str| read_scene(text.as_bytes(), &image).scene.expect("no errors");
-    let block = |text: &&str| prepare(&scene(text)).expect("a plain scene").as_ref().to_vec();
-    SCENES.iter().map(block).collect()
+    let block = |(form, text): (Form, &&str)| {
+        prepare_as(&scene(text), form).expect("a plain scene").as_ref().to_vec()
+    };
+    let in_form = |form| SCENES.iter().map(move |text| (form, text));
+    in_form(Form::Fast).chain(in_form(Form::Compact)).map(block).collect()
 });
 
 /// Where a block keeps the hash of all that follows.
@@ -96,7 +99,7 @@ pub(crate) fn prepared(data: &[u8]) {
         Some(block) => block.clone(),
         None => changes.to_vec(),
     };
-    if usize::from(first) < SCENES.len() {
+    if usize::from(first) < PREPARED.len() {
         for change in changes.chunks_exact(4).take(64) {
             change_block(&mut block, change);
         }

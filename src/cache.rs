@@ -16,6 +16,7 @@ use std::{
 
 use blake3::Hash;
 use rtfarm_core::{
+    prepare::Form,
     prepared::{PreparedBytes, PreparedScene},
     tile::Size,
     transfer::Transfer,
@@ -95,9 +96,9 @@ impl Cache {
     }
 
     /// By which a scene is found; `name` is what its report calls it.
-    pub(crate) fn key(name: &str, text: &[u8], transfer: Transfer) -> Hash {
+    pub(crate) fn key(name: &str, text: &[u8], transfer: Transfer, form: Form) -> Hash {
         let mut hasher = blake3::Hasher::new();
-        hasher.update(format!("{BUILD}\n{transfer:?}\n{name}\0").as_bytes()).update(text);
+        hasher.update(format!("{BUILD}\n{transfer:?} {form:?}\n{name}\0").as_bytes()).update(text);
         hasher.finalize()
     }
 
@@ -264,7 +265,7 @@ mod tests {
     fn what_was_kept_is_found_as_long_as_nothing_changes() {
         let (_folder, cache) = cache(1 << 30);
         let prepared = large();
-        let key = Cache::key("a.rt", b"text", TRANSFER);
+        let key = Cache::key("a.rt", b"text", TRANSFER, Form::Fast);
         assert!(cache.find(&key, read).is_none());
         keep(&cache, &key, &prepared);
         let found = cache.find(&key, read).unwrap();
@@ -274,9 +275,10 @@ mod tests {
         assert!(cache.find(&key, |_| Ok(b"v 0 0 1".to_vec())).is_none(), "a file changed");
         assert!(cache.find(&key, |_| Err(io::Error::other("gone"))).is_none());
         for other in [
-            Cache::key("b.rt", b"text", TRANSFER),
-            Cache::key("a.rt", b"texts", TRANSFER),
-            Cache::key("a.rt", b"text", Transfer::Srgb),
+            Cache::key("b.rt", b"text", TRANSFER, Form::Fast),
+            Cache::key("a.rt", b"texts", TRANSFER, Form::Fast),
+            Cache::key("a.rt", b"text", Transfer::Srgb, Form::Fast),
+            Cache::key("a.rt", b"text", TRANSFER, Form::Compact),
         ] {
             assert!(cache.find(&other, read).is_none());
         }
@@ -285,7 +287,7 @@ mod tests {
     #[test]
     fn a_damaged_or_foreign_entry_is_as_good_as_none() {
         let (_folder, cache) = cache(1 << 30);
-        let key = Cache::key("a.rt", b"text", TRANSFER);
+        let key = Cache::key("a.rt", b"text", TRANSFER, Form::Fast);
         keep(&cache, &key, &large());
         let path = cache.path(&key);
         let whole = fs::read(&path).unwrap();
@@ -309,7 +311,8 @@ mod tests {
         let prepared = large();
         let bytes = prepared.as_ref().len() as u64;
         let (_folder, cache) = cache(4 * bytes + 4096);
-        let keys: Vec<_> = (0..5_u8).map(|n| Cache::key("a.rt", &[n], TRANSFER)).collect();
+        let keys: Vec<_> =
+            (0..5_u8).map(|n| Cache::key("a.rt", &[n], TRANSFER, Form::Fast)).collect();
         for key in &keys[..3] {
             keep(&cache, key, &prepared);
         }
@@ -323,7 +326,7 @@ mod tests {
             b"viewport origin 0 0 9 topleft -1 1 0 bottomleft -1 -1 0 topright 1 1 0 endviewport",
             &|_| Err(io::Error::other("none")),
         );
-        let key = Cache::key("small.rt", b"", TRANSFER);
+        let key = Cache::key("small.rt", b"", TRANSFER, Form::Fast);
         keep(&cache, &key, &prepare(&small.scene.unwrap()).unwrap());
         assert!(cache.find(&key, read).is_none());
     }

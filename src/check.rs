@@ -6,7 +6,7 @@ use anyhow::Context;
 use rtfarm_core::{
     isa::Isa,
     language::{Diagnostic, Reading, Severity, draw_diagnostics, read_scene},
-    prepare::prepare,
+    prepare::{Form, prepare_as},
     prepared::PreparedScene,
     scene::Scene,
 };
@@ -15,7 +15,11 @@ use tokio::task::spawn_blocking;
 use tokio_util::sync::CancellationToken;
 
 use crate::{
-    args::CheckArgs, console::Console, failure::Failure, scene_files::SceneFiles, source::SceneText,
+    args::{CheckArgs, form},
+    console::Console,
+    failure::Failure,
+    scene_files::SceneFiles,
+    source::SceneText,
 };
 
 pub(crate) async fn run(
@@ -33,7 +37,7 @@ pub(crate) async fn run(
             reading = reading.into_strict();
         }
         let report = draw_diagnostics(&args.scene.name(), &text, &reading.diagnostics, style);
-        let findings = reading.scene.as_ref().map(Findings::new);
+        let findings = reading.scene.as_ref().map(|scene| Findings::new(scene, form(args.compact)));
         text.ensure_unchanged().map(|()| (args.json, report, reading, findings))
     });
     let checked = tokio::select! {
@@ -69,7 +73,7 @@ struct Findings {
 }
 
 impl Findings {
-    fn new(scene: &Scene) -> Self {
+    fn new(scene: &Scene, form: Form) -> Self {
         let counts = [
             ("triangles", scene.triangles.len()),
             ("quadrangles", scene.quadrangles.len()),
@@ -86,10 +90,11 @@ impl Findings {
             ("copies of triangles", scene.dropped.duplicates),
         ];
         let (needed, absent): (Vec<_>, Vec<_>) = scene.needs().into_iter().partition(|need| need.1);
-        let prepared = prepare(scene).map_err(|error| error.to_string()).and_then(|bytes| {
-            let opened = PreparedScene::open(bytes).map_err(|error| error.to_string())?;
-            Ok(opened.byte_count())
-        });
+        let prepared =
+            prepare_as(scene, form).map_err(|error| error.to_string()).and_then(|bytes| {
+                let opened = PreparedScene::open(bytes).map_err(|error| error.to_string())?;
+                Ok(opened.byte_count())
+            });
         Self {
             counts: counts.into_iter().filter(|(_, count)| *count > 0).collect(),
             dropped: dropped.into_iter().filter(|(_, count)| *count > 0).collect(),

@@ -578,7 +578,7 @@ async fn place(
     let (scene, cache) = (args.scene.clone(), if has_cache { Cache::of_user() } else { None });
     let (name, style) = (args.scene.name(), Console::drawing_style());
     let placing = spawn_blocking(move || -> io::Result<_> {
-        let key = cache.as_ref().map(|_| Cache::key(&name, &text, request.transfer));
+        let key = cache.as_ref().map(|_| Cache::key(&name, &text, request.transfer, request.form));
         if let (Some(cache), Some(key)) = (&cache, &key) {
             let files = SceneFiles::new(&scene);
             let found = cache.find(key, |name| files.read(name));

@@ -8,6 +8,7 @@ use std::{
 };
 
 use rtfarm_client::{Ended, Finished, JobState, Order, Outside, Trouble};
+use rtfarm_core::prepare::Form;
 use rtfarm_job::{Progress, TimeLeft};
 use rtfarm_proto::{
     Access, CHUNK_BYTES, ConnectError, JobId, MESSAGE_BYTES, PROTOCOL, Reached,
@@ -204,6 +205,7 @@ impl Here<'_> {
             quality: Some(request.quality.into()),
             strict: request.strict,
             crop: request.crop.map(Into::into),
+            compact: request.form == Form::Compact,
             title: self.args.name.clone().unwrap_or_default(),
             owner: self.args.owner.clone().unwrap_or_else(login_name),
             key: self.key.clone(),

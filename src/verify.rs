@@ -10,7 +10,9 @@ use std::{
 
 use anyhow::{Context, anyhow};
 use rayon::prelude::*;
-use rtfarm_core::{isa::Isa, prepared::PreparedScene, render::render_tile, tile::TileId};
+use rtfarm_core::{
+    isa::Isa, prepare::Form, prepared::PreparedScene, render::render_tile, tile::TileId,
+};
 use rtfarm_job::{Order, Provenance, Refusal, RenderRequest};
 use rtfarm_picture::{PictureReader, pixel_bytes};
 use serde_json::json;
@@ -125,7 +127,10 @@ fn verify(
             ));
         }
     }
-    let order = prepare(args, text, &provenance)?;
+    let mut order = prepare(args, text, &provenance, Form::Fast)?;
+    if order.prepared.hash() != scene {
+        order = prepare(args, text, &provenance, Form::Compact)?;
+    }
     if order.prepared.hash() != scene {
         differences.push(format!(
             "the scene differs: the picture says {scene}, {} is {}",
@@ -176,7 +181,12 @@ fn verify(
 }
 
 /// Reads and prepares the scene as the picture says that it was.
-fn prepare(args: &VerifyArgs, text: &SceneText, provenance: &Provenance) -> Result<Order, Failure> {
+fn prepare(
+    args: &VerifyArgs,
+    text: &SceneText,
+    provenance: &Provenance,
+    form: Form,
+) -> Result<Order, Failure> {
     let request = RenderRequest {
         name: args.scene.name(),
         strict: false,
@@ -186,6 +196,7 @@ fn prepare(args: &VerifyArgs, text: &SceneText, provenance: &Provenance) -> Resu
         tile_side: Some(provenance.grid.side().into()),
         transfer: provenance.transfer,
         format: provenance.format,
+        form,
     };
     let files = SceneFiles::new(&args.scene);
     let placed = request.place(text, &|name: &str| files.read(name));

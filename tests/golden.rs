@@ -16,7 +16,7 @@ use rayon::prelude::*;
 use rtfarm_core::{
     isa::Isa,
     language::read_scene,
-    prepare::prepare,
+    prepare::{Form, prepare_as},
     prepared::PreparedScene,
     render::{Quality, Sampling, Settings, render_tile},
     tile::{Area, Size},
@@ -52,7 +52,8 @@ fn render(name: &str) -> Vec<u8> {
         reading.diagnostics.iter().map(|d| format!("{name}.rt:{}: {}", d.at, d.message)).collect();
     assert_eq!(told, Vec::<String>::new(), "our own scenes are without a fault");
     let scene = reading.scene.unwrap();
-    let prepared = PreparedScene::open(prepare(&scene).unwrap()).unwrap();
+    let open = |form| PreparedScene::open(prepare_as(&scene, form).unwrap()).unwrap();
+    let [prepared, compact] = [Form::Fast, Form::Compact].map(open);
     let viewport = scene.viewport.unwrap();
     let size = small(scene.size_hint.unwrap_or_else(|| viewport.default_size()));
     let settings = Settings {
@@ -61,16 +62,20 @@ fn render(name: &str) -> Vec<u8> {
     };
     let area = Area::whole(size);
 
-    let render = |isa| {
-        render_tile(&prepared, &settings.quality, area, isa, &mut || ControlFlow::Continue(()))
+    let render = |prepared, isa| {
+        render_tile(prepared, &settings.quality, area, isa, &mut || ControlFlow::Continue(()))
             .unwrap()
     };
-    let tile = render(Isa::Scalar);
+    let tile = render(&prepared, Isa::Scalar);
     for isa in Isa::ALL.into_iter().filter(|isa| isa.is_supported()) {
         let bits = |pixel: &[f32; 3]| pixel.map(f32::to_bits);
-        let other = render(isa);
-        assert!(tile.pixels.iter().map(bits).eq(other.pixels.iter().map(bits)), "{name}: {isa}");
-        assert_eq!(tile.tally.rays, other.tally.rays, "{name}: {isa}");
+        for other in [render(&prepared, isa), render(&compact, isa)] {
+            assert!(
+                tile.pixels.iter().map(bits).eq(other.pixels.iter().map(bits)),
+                "{name}: {isa}"
+            );
+            assert_eq!(tile.tally.rays, other.tally.rays, "{name}: {isa}");
+        }
     }
     let file = tempfile::tempfile().unwrap();
     let picture = Picture::new(file, size, PictureFormat::Png16, Transfer::None).unwrap();

@@ -21,6 +21,7 @@ use rtfarm_coordinator::{
     Config, Coordinator, Durability, Keeping, Listener, OrderLimits, StateFolder, listen,
 };
 use rtfarm_core::{
+    prepare::Form,
     render::{Quality, Sampling},
     tile::{Size, TileGrid},
     transfer::Transfer,
@@ -163,6 +164,7 @@ fn order(side: u32) -> Order {
         strict: false,
         size: Some(Size::new(16_384, 16_384).expect("a size")),
         crop: None,
+        form: Form::Fast,
         quality: Quality { sampling: Sampling::fixed(1).expect("a number"), ..Quality::default() },
         tile_side: Some(side.into()),
         transfer: Transfer::None,

@@ -10,6 +10,7 @@ use std::{
 };
 
 use rtfarm_core::{
+    prepare::Form,
     render::{Quality, Sampling, Tally},
     tile::{Size, TileId},
     transfer::Transfer,
@@ -50,6 +51,7 @@ fn order() -> Order {
         strict: false,
         size: Some(Size::new(24, 16).unwrap()),
         crop: None,
+        form: Form::Fast,
         quality: Quality { sampling: Sampling::fixed(1).unwrap(), ..Quality::default() },
         tile_side: Some(8),
         transfer: Transfer::None,

@@ -11,6 +11,7 @@ use std::{
 
 use rtfarm_core::{
     language::{Style, draw_diagnostics},
+    prepare::Form,
     render::Tally,
     tile::{Crop, Size, TileId},
 };
@@ -749,10 +750,11 @@ fn to_request(order: wire::Order) -> Result<RenderRequest, WireError> {
     let size = order.frame.map(Size::try_from).transpose()?;
     let transfer = transfer(order.transfer)?;
     let quality = order.quality.ok_or(WireError::Missing("quality"))?.try_into()?;
-    let wire::Order { name, strict, tile_side, crop, .. } = order;
+    let wire::Order { name, strict, tile_side, crop, compact, .. } = order;
     let tile_side = (tile_side > 0).then_some(tile_side.into());
     let crop = crop.map(Into::into);
-    Ok(RenderRequest { name, strict, size, crop, quality, tile_side, transfer, format })
+    let form = if compact { Form::Compact } else { Form::Fast };
+    Ok(RenderRequest { name, strict, size, crop, quality, tile_side, transfer, format, form })
 }
 
 /// Tells a worker all about its tiles; one on this machine also where the scene is.

@@ -19,6 +19,7 @@ use prost::Message;
 use rtfarm_client::{Ended, JobState, NoPicture, Trouble};
 use rtfarm_core::{
     isa::Isa,
+    prepare::Form,
     prepared::PreparedScene,
     render::{Quality, Sampling, Tally, render_tile},
     transfer::Transfer,
@@ -101,6 +102,7 @@ fn request() -> RenderRequest {
         strict: false,
         size: Some(rtfarm_core::tile::Size::new(FRAME.0, FRAME.1).unwrap()),
         crop: None,
+        form: Form::Fast,
         quality: Quality { sampling: Sampling::fixed(1).unwrap(), ..Quality::default() },
         tile_side: Some(SIDE),
         transfer: Transfer::None,

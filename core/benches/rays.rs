@@ -1,10 +1,10 @@
 //! Rays through a mesh, class by class: how many a second, or how many instructions each takes.
 //!
-//!     cargo bench -p rtfarm-core --bench rays [-- TRIANGLES]
+//!     cargo bench -p rtfarm-core --bench rays [-- TRIANGLES [single] [compact]]
 //!     cargo bench -p rtfarm-core --bench rays -- --check | --update
 //!
 //! The first prints millions of rays a second for each instruction set: medians of five runs on one
-//! thread. `--check` counts instructions by callgrind with AVX2 and fails where a ray takes over 3 %
+//! thread; with corners in single precision, or of the scene in its compact form. `--check` counts instructions by callgrind with AVX2 and fails where a ray takes over 3 %
 //! more than `rays.tsv` says; `--update` writes that file anew. Both say so and do nothing else
 //! where valgrind or AVX2 is missing.
 
@@ -22,9 +22,10 @@ use bottle::bottle;
 use glam::DVec3;
 use rtfarm_core::{
     isa::Isa,
-    prepare::prepare,
+    prepare::{Form, prepare_as},
     prepared::{PreparedBytes, PreparedScene},
     render::{Quality, Sampling, render_tile},
+    scene::Scene,
     testing::{Probe, Probing},
     tile::{Size, TileGrid},
 };
@@ -47,10 +48,10 @@ struct Bench {
 }
 
 impl Bench {
-    fn new(triangles: usize, [width, height]: [u32; 2]) -> Self {
-        let scene = bottle(triangles);
+    fn new(scene: &Scene, form: Form, [width, height]: [u32; 2]) -> Self {
         let viewport = scene.viewport.expect("the bottle has one");
-        let scene = PreparedScene::open(prepare(&scene).expect("a plain scene")).expect("valid");
+        let bytes = prepare_as(scene, form).expect("a plain scene");
+        let scene = PreparedScene::open(bytes).expect("valid");
         let [right, down] =
             [viewport.top_right, viewport.bottom_left].map(|corner| corner - viewport.top_left);
         let mut camera = Vec::new();
@@ -107,20 +108,29 @@ fn main() {
         && flag == "--only"
     {
         let [class, times] = [class, times].map(|word| word.parse().expect("a number"));
-        let bench = Bench::new(COUNTED, [320, 184]);
+        let bench = Bench::new(&bottle(COUNTED), Form::Fast, [320, 184]);
         let rays: u64 = (0..times).map(|_| bench.run(class, Isa::Avx2)).sum();
         println!("{}", rays / times.max(1) as u64);
     } else if has("--check") || has("--update") {
         count_all(has("--update"));
     } else {
+        let form = if has("compact") { Form::Compact } else { Form::Fast };
         let triangles = words.iter().find_map(|word| word.parse().ok()).unwrap_or(100_000);
-        tell_speeds(triangles);
+        tell_speeds(triangles, has("single"), form);
     }
 }
 
-fn tell_speeds(triangles: usize) {
-    let bench = Bench::new(triangles, [1280, 720]);
-    println!("bottle of {triangles} triangles, Mrays/s on one thread, medians of 5");
+fn tell_speeds(triangles: usize, is_single: bool, form: Form) {
+    let mut scene = bottle(triangles);
+    if is_single {
+        for corner in scene.triangles.iter_mut().flat_map(|face| &mut face.vertices) {
+            *corner = corner.as_vec3().as_dvec3();
+        }
+    }
+    let bench = Bench::new(&scene, form, [1280, 720]);
+    let bytes = bench.scene.byte_count() as f64 / triangles as f64;
+    println!("bottle of {triangles} triangles, {form:?}, {bytes:.1} bytes each");
+    println!("Mrays/s on one thread, medians of 5");
     for (class, name) in CLASSES.iter().enumerate() {
         for isa in Isa::ALL.into_iter().filter(|isa| isa.is_supported()) {
             let mut speeds = [0.0; 5];

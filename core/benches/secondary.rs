@@ -16,7 +16,7 @@ use std::{env, fs, ops::ControlFlow, path::Path, time::Instant};
 use rtfarm_core::{
     isa::Isa,
     language::read_scene,
-    prepare::prepare,
+    prepare::{Form, prepare},
     prepared::{PreparedBytes, PreparedScene},
     render::{Quality, RenderedTile, Sampling, Settings, render_tile},
     testing::prepare_with,
@@ -55,7 +55,7 @@ fn ways(name: &str) -> [(&'static str, Block); 2] {
     let scene = read_scene(&text, &nothing).scene.expect("a scene without a fault");
     let open = |bytes| PreparedScene::open(bytes).expect("a valid block");
     [
-        ("spread", open(prepare_with(&scene, false).expect("a scene"))),
+        ("spread", open(prepare_with(&scene, Form::Fast, false).expect("a scene"))),
         ("aimed", open(prepare(&scene).expect("a scene"))),
     ]
 }

@@ -2,7 +2,7 @@
 
 use rtfarm_core::{
     language::{Diagnostic, Omitted, Reading, Resolve, read_scene_with},
-    prepare::{PrepareError, prepare},
+    prepare::{Form, PrepareError, prepare_as},
     prepared::PreparedBytes,
     render::{Quality, Settings},
     scene::Scene,
@@ -33,6 +33,8 @@ pub struct RenderRequest {
     pub transfer: Transfer,
     /// How the picture is written.
     pub format: PictureFormat,
+    /// What the prepared scene is to be good at.
+    pub form: Form,
 }
 
 /// All that a job needs.
@@ -107,7 +109,7 @@ impl RenderRequest {
         let other = |error: PrepareError| Refusal::Other(error.to_string());
         let size = own_size(scene).ok_or(PrepareError::NoViewport).map_err(other)?;
         let (settings, grid) = self.frame(size)?;
-        let prepared = prepare(scene).map_err(other)?;
+        let prepared = prepare_as(scene, self.form).map_err(other)?;
         Ok(self.order(prepared, settings, grid))
     }
 
@@ -166,6 +168,7 @@ mod tests {
             tile_side: None,
             transfer: Transfer::None,
             format: PictureFormat::Png8,
+            form: Form::Fast,
         }
     }
 

@@ -152,5 +152,5 @@ fn polygon_importance(view: &View<'_>, emitter: &EmitterRecord, receiver: &Recei
 
 /// Reads the corners of a polygon; the last two of a triangle are one.
 pub(super) fn corners(view: &View<'_>, emitter: &EmitterRecord) -> [DVec3; 4] {
-    emitter.vertices.map(|vertex| DVec3::from_array(view.vertices[vertex as usize]))
+    emitter.vertices.map(|vertex| DVec3::from_array(view.vertex(vertex)))
 }

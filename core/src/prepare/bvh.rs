@@ -22,9 +22,14 @@ const BINS: usize = 16;
 /// Ranges of up to this many items have half as many bins.
 const FEW: usize = 32;
 
-/// Ranges of up to this many faces are leaves. Splitting them further makes a triangle mesh no
-/// faster to trace and takes half as many bytes again.
-const LEAF: usize = 4;
+/// Which ranges are leaves.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Leaves {
+    /// Those of up to this many items, at most [`Child::MOST_ITEMS`].
+    pub(super) most: usize,
+    /// Items from this number on, which are costly to meet, have a leaf each.
+    pub(super) alone_from: u32,
+}
 
 /// An axis-aligned box. The fourth numbers mean nothing: with them a corner is one load.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -83,24 +88,22 @@ struct BuildRange<'a> {
     bounds: Bounds,
     /// The bounds of twice the centres.
     centers: Bounds,
-    /// Items from this number on have a leaf each.
-    alone_from: u32,
+    leaves: Leaves,
 }
 
 /// Builds the hierarchy over `primitives` and brings them into the order in which leaves name them.
-/// Items from the number `alone_from` on, which are costly to meet, have a leaf each. The root is
-/// node 0; every other node stands after its parent.
-pub(super) fn build_bvh(primitives: &mut [BuildPrimitive], alone_from: u32) -> Vec<Node> {
+/// The root is node 0; every other node stands after its parent.
+pub(super) fn build_bvh(primitives: &mut [BuildPrimitive], leaves: Leaves) -> Vec<Node> {
     if primitives.is_empty() {
         return vec![Node::EMPTY];
     }
     let mut nodes = Vec::new();
-    build_node(BuildRange::new(primitives, 0, alone_from), 0, &mut nodes);
+    build_node(BuildRange::new(primitives, 0, leaves), 0, &mut nodes);
     nodes
 }
 
 impl<'a> BuildRange<'a> {
-    fn new(primitives: &'a mut [BuildPrimitive], first: usize, alone_from: u32) -> Self {
+    fn new(primitives: &'a mut [BuildPrimitive], first: usize, leaves: Leaves) -> Self {
         let measure = |chunk: &[BuildPrimitive]| {
             chunk.iter().fold((Bounds::NONE, Bounds::NONE), |(bounds, centers), primitive| {
                 let middle = primitive.0.twice_center();
@@ -116,7 +119,7 @@ impl<'a> BuildRange<'a> {
         } else {
             measure(primitives)
         };
-        Self { primitives, first, bounds, centers, alone_from }
+        Self { primitives, first, bounds, centers, leaves }
     }
 
     /// Splits in two where it is cheapest.
@@ -127,7 +130,7 @@ impl<'a> BuildRange<'a> {
             None => self.primitives.len() / 2, // Nothing tells them apart.
         };
         let (left, right) = self.primitives.split_at_mut(at);
-        let range = |half, first| BuildRange::new(half, first, self.alone_from);
+        let range = |half, first| BuildRange::new(half, first, self.leaves);
         [range(left, self.first), range(right, self.first + at)]
     }
 
@@ -137,9 +140,9 @@ impl<'a> BuildRange<'a> {
     }
 
     fn is_leaf(&self) -> bool {
-        let is_alone = |primitive: &BuildPrimitive| primitive.item() >= self.alone_from;
+        let is_alone = |primitive: &BuildPrimitive| primitive.item() >= self.leaves.alone_from;
         self.primitives.len() == 1
-            || self.primitives.len() <= LEAF && !self.primitives.iter().any(is_alone)
+            || self.primitives.len() <= self.leaves.most && !self.primitives.iter().any(is_alone)
     }
 
     /// The split between two bins with the least area x count on its sides; `None` where the
@@ -328,13 +331,15 @@ mod tests {
     use super::*;
     use crate::prepared::node::MOST_LEVELS;
 
+    const LEAVES: Leaves = Leaves { most: 4, alone_from: u32::MAX };
+
     fn check(boxes: &[([f32; 3], [f32; 3])]) -> Vec<Node> {
         let mut primitives: Vec<BuildPrimitive> = boxes
             .iter()
             .enumerate()
             .map(|(item, &(min, max))| BuildPrimitive::new(min, max, item as u32))
             .collect();
-        let nodes = build_bvh(&mut primitives, u32::MAX);
+        let nodes = build_bvh(&mut primitives, LEAVES);
         let mut seen = vec![0; boxes.len()];
         let mut levels = vec![1; nodes.len()];
         for (index, node) in nodes.iter().enumerate() {
@@ -442,7 +447,7 @@ mod tests {
                 let middle = |primitive: &BuildPrimitive| primitive.0.twice_center()[axis];
                 range.primitives.sort_by(|a, b| middle(a).total_cmp(&middle(b)));
                 let (left, right) = range.primitives.split_at_mut(at);
-                [left, right].map(|half| BuildRange::new(half, 0, u32::MAX))
+                [left, right].map(|half| BuildRange::new(half, 0, LEAVES))
             }
         };
         area + halves.into_iter().map(|half| cost(half, splitter, root_area)).sum::<f64>()
@@ -461,7 +466,7 @@ mod tests {
             .collect();
         let cost_of = |splitter| {
             let mut primitives = primitives.clone();
-            let range = BuildRange::new(&mut primitives, 0, u32::MAX);
+            let range = BuildRange::new(&mut primitives, 0, LEAVES);
             let area = f64::from(range.bounds.half_area());
             cost(range, splitter, area)
         };

@@ -38,11 +38,10 @@ impl Emitters {
             return Self::default();
         }
         let mut search = Search { materials, lights, ambient, found: Vec::new() };
-        for face in &faces.triangles {
-            search.add_polygon((face.material, face.rank), &face.vertices, &faces.vertices);
-        }
-        for face in &faces.coplanars {
-            search.add_polygon((face.material, face.rank), &face.vertices, &faces.vertices);
+        for face in &faces.faces {
+            if let Some((_, material)) = faces.plane_and_material(face) {
+                search.add_polygon((material, face.rank()), &face.vertices, &faces.vertices);
+            }
         }
         for face in &faces.quadrangles {
             search.add_polygon((face.material, face.rank), &face.vertices, &faces.vertices);

@@ -4,14 +4,19 @@ use glam::DVec3;
 use rayon::prelude::*;
 
 use super::{
-    bvh::{BuildPrimitive, build_bvh},
+    Form,
+    bvh::{BuildPrimitive, Leaves, build_bvh},
     flat::bounds_of,
     surfaces::Surfaces,
 };
 use crate::{
     exact::float::{above, below, power_of_two_below_inverse},
-    prepared::node::{Frame, Node},
+    prepared::node::{Child, Frame, Node},
 };
+
+/// The most faces in a leaf of a scene that is not compact. Splitting them further makes a triangle mesh
+/// no faster to trace and takes half as many bytes again.
+const FEW: usize = 4;
 
 /// The hierarchy over all items of a scene: flat faces, spheres and solids.
 pub(super) struct Hierarchy {
@@ -25,11 +30,12 @@ pub(super) struct Hierarchy {
 
 impl Hierarchy {
     /// Builds the hierarchy.
-    pub(crate) fn new(surfaces: &Surfaces) -> Self {
+    pub(crate) fn new(surfaces: &Surfaces, form: Form) -> Self {
         let frame = frame_around(surfaces);
         let mut primitives = build_primitives(surfaces, &frame);
+        let most = if form == Form::Compact { Child::MOST_ITEMS } else { FEW };
         let first_solid = surfaces.flat.item_count() + surfaces.spheres.len();
-        let nodes = build_bvh(&mut primitives, first_solid as u32);
+        let nodes = build_bvh(&mut primitives, Leaves { most, alone_from: first_solid as u32 });
         let order = primitives.into_iter().map(|primitive| primitive.item()).collect();
         Self { frame, nodes, order }
     }

@@ -55,14 +55,15 @@ fn surfaces_at(point: DVec3, faces: &Sorted) -> Vec<Surface> {
         let normal = || DVec3::from_array(faces.planes[plane.index()].normal);
         flat_at(corners, &normal, plane.surface())
     };
-    let triangles = faces.triangles.par_iter().filter_map(|triangle| {
+    let triangles = faces.faces.par_iter().filter_map(|face| {
+        if let (Some(plane), _) = faces.plane_and_material(face)? {
+            return in_plane(&face.vertices, plane);
+        }
         let corner = |v: u32| DVec3::from_array(faces.vertices[v as usize]);
-        let normal = || triangle_normal(triangle.vertices.map(corner));
-        flat_at(&triangle.vertices, &normal, Surface(triangle.rank))
+        let normal = || triangle_normal(face.vertices.map(corner));
+        flat_at(&face.vertices, &normal, Surface(face.rank()))
     });
     let mut surfaces: Vec<Surface> = triangles.collect();
-    let coplanars = faces.coplanars.par_iter();
-    surfaces.par_extend(coplanars.filter_map(|face| in_plane(&face.vertices, face.plane)));
     let quadrangles = faces.quadrangles.par_iter();
     surfaces.par_extend(quadrangles.filter_map(|face| in_plane(&face.vertices, face.plane)));
     let is_on_sphere = |center: [f64; 3], radius: f64| {

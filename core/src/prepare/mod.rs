@@ -3,7 +3,8 @@
 //! Every step takes what the step before it made, so they cannot be called in another order:
 //! faces are collected, scaled and welded, share their surfaces, get their hierarchy and are sorted
 //! into records in its order. Then lights find the surfaces that they lie on, materials their
-//! images, and emitters the light that they send on; all of it is assembled as one block.
+//! images, and emitters the light that they send on; a compact scene gets the nodes and the vertices
+//! of its form, and all is assembled as one block.
 
 mod bvh;
 mod collect;
@@ -24,6 +25,7 @@ mod plane_fingerprint;
 mod planes;
 mod ranks;
 mod scale;
+mod single;
 mod solid_boxes;
 mod solid_trees;
 mod sort;
@@ -32,25 +34,44 @@ mod textures;
 mod weld;
 
 use glam::DVec3;
+use rayon::prelude::*;
 
 pub use self::error::PrepareError;
 use self::{
     collect::Collected, emitters::Emitters, features::features, hierarchy::Hierarchy,
-    lights::Lights, ranks::Ranks, scale::extent_of_eye_and_lights, textures::Textures,
+    lights::Lights, ranks::Ranks, scale::extent_of_eye_and_lights, single::split_vertices,
+    textures::Textures,
 };
 use crate::{
     prepared::{
         bytes::{PreparedBytes, assemble},
         layout::Sections,
+        node::CompactNode,
         record::{Camera, Lighting},
     },
     scene::{Scene, Viewport},
 };
 
+/// What a prepared scene is to be good at. Its pictures do not depend on it.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub enum Form {
+    /// It is traced fast.
+    #[default]
+    Fast,
+    /// It takes little memory: its leaves hold more faces, the boxes of its hierarchy have 8 bits a
+    /// bound, and vertices that single precision holds exactly are kept in it.
+    Compact,
+}
+
 /// Turns a scene into a prepared scene, on rayon's threads; the same scene gives the same bytes on
 /// any number of them.
 pub fn prepare(scene: &Scene) -> Result<PreparedBytes, PrepareError> {
-    prepare_with(scene, true)
+    prepare_as(scene, Form::Fast)
+}
+
+/// The same in a form.
+pub fn prepare_as(scene: &Scene, form: Form) -> Result<PreparedBytes, PrepareError> {
+    prepare_with(scene, form, true)
 }
 
 /// The same. Without records of the emitters, light that faces send on is looked for over the
@@ -58,6 +79,7 @@ pub fn prepare(scene: &Scene) -> Result<PreparedBytes, PrepareError> {
 #[doc(hidden)]
 pub fn prepare_with(
     scene: &Scene,
+    form: Form,
     keeps_emitter_records: bool,
 ) -> Result<PreparedBytes, PrepareError> {
     let viewport = scene.viewport.ok_or(PrepareError::NoViewport)?;
@@ -66,7 +88,7 @@ pub fn prepare_with(
     let scaled = Collected::new(scene, &ranks).scale(extent_of_eye_and_lights(scene, &viewport));
     let scale = scaled.scale;
     let surfaces = scaled.weld().share_surfaces(&ranks);
-    let Hierarchy { frame, nodes, order } = Hierarchy::new(&surfaces);
+    let Hierarchy { frame, mut nodes, order } = Hierarchy::new(&surfaces, form);
     let mut faces = surfaces.sort(&order);
     drop(order);
 
@@ -84,14 +106,22 @@ pub fn prepare_with(
         emitters = Emitters::default();
     }
 
+    let (mut compact_nodes, mut single_vertices) = (Vec::new(), Vec::new());
+    if form == Form::Compact {
+        compact_nodes.par_extend(nodes.par_iter().map(CompactNode::new));
+        nodes = Vec::new();
+        single_vertices = split_vertices(&mut faces, &mut emitters.records);
+    }
+
     let lighting =
         Lighting { background: scene.background.to_array(), ambient: ambient.to_array() };
     let sections = Sections {
         nodes: &nodes,
-        items: &faces.items,
+        compact_nodes: &compact_nodes,
+        faces: &faces.faces,
         vertices: &faces.vertices,
-        triangles: &faces.triangles,
-        coplanars: &faces.coplanars,
+        single_vertices: &single_vertices,
+        coats: &faces.coats,
         quadrangles: &faces.quadrangles,
         spheres: &faces.spheres,
         planes: &faces.planes,

@@ -3,7 +3,7 @@
 use glam::DVec3;
 
 use super::{
-    bvh::{BuildPrimitive, build_bvh},
+    bvh::{BuildPrimitive, Leaves, build_bvh},
     solid_trees::node_bounds,
 };
 use crate::{
@@ -62,7 +62,7 @@ pub(super) fn enclose_leaves(
             counts.then(|| BuildPrimitive::new(min, max, item))
         })
         .collect();
-    let built = build_bvh(&mut primitives, 0);
+    let built = build_bvh(&mut primitives, Leaves { most: 1, alone_from: 0 });
     solid.first_box = boxes.len() as u32;
     boxes.extend(built.into_iter().map(|mut node| {
         node.children = node.children.map(|child| {

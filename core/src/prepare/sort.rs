@@ -1,23 +1,24 @@
 //! The sixth step: records in the order of the hierarchy's leaves.
 
+use std::collections::HashMap;
+
 use glam::DVec3;
 
 use super::{flat::FaceAttributes, surfaces::Surfaces};
 use crate::prepared::{
     node::Node,
     record::{
-        BoxPlanes, CoplanarRecord, Item, Kind, LeafRecord, PlaneRecord, QuadrangleRecord,
-        SolidNodeRecord, SolidRecord, SphereRecord, TriangleRecord,
+        BoxPlanes, Coat, FaceRecord, Kind, LeafRecord, PlaneIndex, PlaneRecord, QuadrangleRecord,
+        SolidNodeRecord, SolidRecord, SphereRecord,
     },
 };
 
 /// The records of all faces. Those of each kind stand in the order of the hierarchy's leaves, and
 /// vertices in the order in which leaves come to them.
 pub(super) struct Sorted {
-    pub(super) items: Vec<Item>,
+    pub(super) faces: Vec<FaceRecord>,
     pub(super) vertices: Vec<[f64; 3]>,
-    pub(super) triangles: Vec<TriangleRecord>,
-    pub(super) coplanars: Vec<CoplanarRecord>,
+    pub(super) coats: Vec<Coat>,
     pub(super) quadrangles: Vec<QuadrangleRecord>,
     pub(super) spheres: Vec<SphereRecord>,
     pub(super) planes: Vec<PlaneRecord>,
@@ -35,14 +36,32 @@ pub(super) struct Sorted {
     pub(super) box_corners: Vec<DVec3>,
 }
 
+impl Sorted {
+    /// The plane that a triangle shares with other faces, if it does, and its material; `None` for an
+    /// item of another kind.
+    pub(super) fn plane_and_material(
+        &self,
+        face: &FaceRecord,
+    ) -> Option<(Option<PlaneIndex>, u32)> {
+        match face.item(0).kind()? {
+            Kind::Triangle => Some((None, face.material())),
+            Kind::Coplanar => {
+                let Coat { plane, material } = self.coats[face.coat()];
+                Some((Some(plane), material))
+            }
+            Kind::Quadrangle | Kind::Sphere | Kind::Solid => None,
+        }
+    }
+}
+
 impl Surfaces {
     /// Makes the records of all items, in this order of their numbers.
     pub(super) fn sort(self, order: &[u32]) -> Sorted {
         let Self { flat, solids: solids_in_file_order, .. } = self;
-        let mut items = Vec::with_capacity(order.len());
+        let mut faces = Vec::with_capacity(order.len());
         let mut vertices = Vec::new();
-        let mut triangles = Vec::new();
-        let mut coplanars = Vec::new();
+        let mut coats = Vec::new();
+        let mut coat_places = HashMap::new();
         let mut quadrangles = Vec::new();
         let mut spheres = Vec::new();
         let mut solids = Vec::new();
@@ -51,10 +70,10 @@ impl Surfaces {
             let face = item as usize;
             if let Some(round) = face.checked_sub(flat.item_count()) {
                 if let Some(&sphere) = self.spheres.get(round) {
-                    items.push(Item::new(Kind::Sphere, spheres.len()));
+                    faces.push(FaceRecord::of(Kind::Sphere, spheres.len()));
                     spheres.push(sphere);
                 } else {
-                    items.push(Item::new(Kind::Solid, solids.len()));
+                    faces.push(FaceRecord::of(Kind::Solid, solids.len()));
                     solids.push(solids_in_file_order[round - self.spheres.len()]);
                 }
                 continue;
@@ -72,21 +91,23 @@ impl Surfaces {
             let FaceAttributes { material, rank } = flat.attributes[face];
             if let Some(quadrangle) = face.checked_sub(flat.triangle_count) {
                 let plane = self.quadrangle_planes[quadrangle];
-                items.push(Item::new(Kind::Quadrangle, quadrangles.len()));
+                faces.push(FaceRecord::of(Kind::Quadrangle, quadrangles.len()));
                 quadrangles.push(QuadrangleRecord::new(corners, material, rank, plane));
             } else if let Some(plane) = self.triangle_planes[face] {
-                items.push(Item::new(Kind::Coplanar, coplanars.len()));
-                coplanars.push(CoplanarRecord { vertices: [a, b, c], material, rank, plane });
+                let coat = Coat { plane, material };
+                let place = *coat_places.entry(coat).or_insert_with(|| {
+                    coats.push(coat);
+                    coats.len() as u32 - 1
+                });
+                faces.push(FaceRecord::coplanar([a, b, c], place, rank));
             } else {
-                items.push(Item::new(Kind::Triangle, triangles.len()));
-                triangles.push(TriangleRecord { vertices: [a, b, c], material, rank });
+                faces.push(FaceRecord::triangle([a, b, c], material, rank));
             }
         }
         Sorted {
-            items,
+            faces,
             vertices,
-            triangles,
-            coplanars,
+            coats,
             quadrangles,
             spheres,
             planes: self.planes,

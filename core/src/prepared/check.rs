@@ -2,7 +2,7 @@
 
 use super::{
     layout::View,
-    node::{Child, MOST_LEVELS, Node},
+    node::{Child, CompactNode, MOST_LEVELS, Node},
     record::{
         EmitterNode, EmitterRecord, Kind, LeafRecord, MaterialRecord, NO_NODE, PlaneIndex,
         SolidNodeKind, SolidNodeRecord, TexturedFace,
@@ -26,27 +26,31 @@ pub(super) fn check(view: &View<'_>) -> Result<(), &'static str> {
     ensure(is_scale(header.scale) && is_scale(header.frame.scale), "a scale")?;
     ensure(finite(&header.frame.origin), "the frame")?;
 
-    check_hierarchies(view.nodes, [(Node::ROOT, view.items.len())])?;
-    for item in view.items {
-        let count = match item.kind().ok_or("an item")? {
-            Kind::Triangle => view.triangles.len(),
-            Kind::Coplanar => view.coplanars.len(),
-            Kind::Quadrangle => view.quadrangles.len(),
-            Kind::Sphere => view.spheres.len(),
-            Kind::Solid => view.solids.len(),
-        };
-        ensure(item.index() < count, "an item")?;
+    let root = [(Node::ROOT, view.faces.len())];
+    if view.compact_nodes.is_empty() {
+        check_hierarchies(view.nodes.iter().copied(), root)?;
+    } else {
+        ensure(view.nodes.is_empty(), "nodes of two kinds")?;
+        check_hierarchies(view.compact_nodes.iter().map(CompactNode::expand), root)?;
     }
     ensure(view.vertices.iter().all(|vertex| finite(vertex)), "a vertex")?;
-    let vertices = |indices: &[u32]| indices.iter().all(|&k| (k as usize) < view.vertices.len());
+    let is_finite = |vertex: &[f32; 3]| vertex.iter().all(|x| x.is_finite());
+    ensure(view.single_vertices.iter().all(is_finite), "a vertex")?;
+    let vertices = |indices: &[u32]| indices.iter().all(|&k| (k as usize) < view.vertex_count());
     let material = |index: u32| (index as usize) < view.materials.len();
     let plane = |index: PlaneIndex| index.index() < view.planes.len();
-    for face in view.triangles {
-        ensure(vertices(&face.vertices) && material(face.material), "a triangle")?;
+    for (face, item) in view.faces.iter().zip(view.all_items()) {
+        let is_whole = match item.kind().ok_or("an item")? {
+            Kind::Triangle => vertices(&face.vertices) && material(face.material()),
+            Kind::Coplanar => vertices(&face.vertices) && face.coat() < view.coats.len(),
+            Kind::Quadrangle => item.index() < view.quadrangles.len(),
+            Kind::Sphere => item.index() < view.spheres.len(),
+            Kind::Solid => item.index() < view.solids.len(),
+        };
+        ensure(is_whole, "an item")?;
     }
-    for face in view.coplanars {
-        let whole = vertices(&face.vertices) && material(face.material) && plane(face.plane);
-        ensure(whole, "a triangle")?;
+    for coat in view.coats {
+        ensure(plane(coat.plane) && material(coat.material), "a coat")?;
     }
     for face in view.quadrangles {
         let whole = vertices(&face.vertices) && material(face.material) && plane(face.plane);
@@ -92,7 +96,7 @@ pub(super) fn check(view: &View<'_>) -> Result<(), &'static str> {
         ensure(is_doubt, "a solid's margin")?;
     }
     let roots = view.solids.iter().map(|solid| (solid.first_box as usize, solid.leaves().len()));
-    check_hierarchies(view.solid_boxes, roots)?;
+    check_hierarchies(view.solid_boxes.iter().copied(), roots)?;
     for light in view.lights {
         let is_finite = light.intensity.iter().all(|channel| channel.is_finite());
         ensure(finite(&light.position) && is_finite, "a light")?;
@@ -105,7 +109,7 @@ pub(super) fn check(view: &View<'_>) -> Result<(), &'static str> {
 
 /// Checks that nodes are trees with these roots, whose leaves name items below a number.
 fn check_hierarchies(
-    nodes: &[Node],
+    nodes: impl ExactSizeIterator<Item = Node>,
     roots: impl IntoIterator<Item = (usize, usize)>,
 ) -> Result<(), &'static str> {
     let ensure = |holds: bool, what: &'static str| if holds { Ok(()) } else { Err(what) };
@@ -115,7 +119,7 @@ fn check_hierarchies(
         ensure(known.0 == 0, "two roots in one place")?;
         *known = (1, limit);
     }
-    for (index, node) in nodes.iter().enumerate() {
+    for (index, node) in nodes.enumerate() {
         let (level, limit) = known[index];
         ensure(level > 0, "a node without a parent")?;
         ensure(node.planes.as_flattened().iter().all(|x| !x.is_nan()), "a box")?;
@@ -164,7 +168,7 @@ fn check_emitters(view: &View<'_>) -> Result<(), &'static str> {
     let ensure = |holds: bool, what: &'static str| if holds { Ok(()) } else { Err(what) };
     let finite = |numbers: &[f64]| numbers.iter().all(|x| x.is_finite() && x.abs() < 1e100);
     let vertices = |emitter: &EmitterRecord| {
-        emitter.vertices.iter().all(|&k| (k as usize) < view.vertices.len()) || emitter.is_sphere()
+        emitter.vertices.iter().all(|&k| (k as usize) < view.vertex_count()) || emitter.is_sphere()
     };
     for emitter in view.emitters {
         let is_place = finite(&emitter.middle) && finite(&emitter.vector_area);

@@ -77,8 +77,7 @@ impl Face {
     pub(crate) fn rank(self, view: &View<'_>) -> Option<u32> {
         let index = self.item.index();
         Some(match self.item.kind()? {
-            Kind::Triangle => view.triangles[index].rank,
-            Kind::Coplanar => view.coplanars[index].rank,
+            Kind::Triangle | Kind::Coplanar => view.faces[index].rank(),
             Kind::Quadrangle => view.quadrangles[index].rank,
             Kind::Sphere => view.spheres[index].rank,
             Kind::Solid => self.part.rank(&view.solids[index]),
@@ -90,8 +89,8 @@ impl Face {
     pub(crate) fn surface(self, view: &View<'_>) -> Surface {
         let index = self.item.index();
         match self.item.kind() {
-            Some(Kind::Triangle) => Surface(view.triangles[index].rank),
-            Some(Kind::Coplanar) => view.coplanars[index].plane.surface(),
+            Some(Kind::Triangle) => Surface(view.faces[index].rank()),
+            Some(Kind::Coplanar) => view.coat(&view.faces[index]).plane.surface(),
             Some(Kind::Quadrangle) => view.quadrangles[index].plane.surface(),
             Some(Kind::Sphere) => Surface(view.spheres[index].surface),
             Some(Kind::Solid) => {
@@ -113,8 +112,8 @@ impl Face {
     pub(crate) fn material_index(self, view: &View<'_>) -> u32 {
         let index = self.item.index();
         match self.item.kind() {
-            Some(Kind::Triangle) => view.triangles[index].material,
-            Some(Kind::Coplanar) => view.coplanars[index].material,
+            Some(Kind::Triangle) => view.faces[index].material(),
+            Some(Kind::Coplanar) => view.coat(&view.faces[index]).material,
             Some(Kind::Quadrangle) => view.quadrangles[index].material,
             Some(Kind::Sphere) => view.spheres[index].material,
             Some(Kind::Solid) => self.part.leaf_of(view, &view.solids[index]).material,
@@ -134,10 +133,10 @@ impl Face {
         let index = self.item.index();
         match self.item.kind().expect("a checked item") {
             Kind::Triangle => {
-                let corners = view.corners(&view.triangles[index].vertices);
-                triangle_normal(corners.map(|&corner| DVec3::from_array(corner)))
+                let corners = view.corners(&view.faces[index].vertices);
+                triangle_normal(corners.map(DVec3::from_array))
             }
-            Kind::Coplanar => of_plane(view.coplanars[index].plane),
+            Kind::Coplanar => of_plane(view.coat(&view.faces[index]).plane),
             Kind::Quadrangle => of_plane(view.quadrangles[index].plane),
             Kind::Sphere => of_sphere(view.spheres[index].center),
             Kind::Solid => {
@@ -165,7 +164,7 @@ impl Face {
                 let point = self.polygon(view)?.corners()[0];
                 Some((point, self.normal(view, point)))
             }
-            Kind::Coplanar => of_plane(view.coplanars[index].plane),
+            Kind::Coplanar => of_plane(view.coat(&view.faces[index]).plane),
             Kind::Quadrangle => of_plane(view.quadrangles[index].plane),
             Kind::Sphere => None,
             Kind::Solid => {
@@ -211,8 +210,9 @@ impl Face {
     pub(crate) fn polygon(self, view: &View<'_>) -> Option<Polygon> {
         let index = self.item.index();
         match self.item.kind()? {
-            Kind::Triangle => Some(Polygon::new(view, &view.triangles[index].vertices)),
-            Kind::Coplanar => Some(Polygon::new(view, &view.coplanars[index].vertices)),
+            Kind::Triangle | Kind::Coplanar => {
+                Some(Polygon::new(view, &view.faces[index].vertices))
+            }
             Kind::Quadrangle => Some(Polygon::new(view, &view.quadrangles[index].vertices)),
             Kind::Sphere | Kind::Solid => None,
         }
@@ -230,7 +230,7 @@ impl Polygon {
     fn new(view: &View<'_>, vertices: &[u32]) -> Self {
         let mut corners = [DVec3::ZERO; 4];
         for (corner, &vertex) in corners.iter_mut().zip(vertices) {
-            *corner = DVec3::from_array(view.vertices[vertex as usize]);
+            *corner = DVec3::from_array(view.vertex(vertex));
         }
         Self { corners, count: vertices.len() }
     }

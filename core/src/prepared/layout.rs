@@ -1,19 +1,21 @@
 //! The order of a block: its header and its sections.
 
+use std::ops::Range;
+
 use super::{
-    node::{Frame, Node},
+    node::{CompactNode, Frame, Node},
     record::{
-        BoxPlanes, Camera, CoplanarRecord, EmitterNode, EmitterRecord, Features, Item, LeafRecord,
-        LevelRecord, LightRecord, Lighting, MaterialRecord, PlaneRecord, QuadrangleRecord,
-        SolidNodeRecord, SolidRecord, SphereRecord, Surface, TextureRecord, TexturedFace,
-        TriangleRecord,
+        BoxPlanes, Camera, Coat, EmitterNode, EmitterRecord, FaceRecord, Features, Item,
+        LeafRecord, LevelRecord, LightRecord, Lighting, MaterialRecord, PlaneRecord,
+        QuadrangleRecord, SolidNodeRecord, SolidRecord, SphereRecord, Surface, TextureRecord,
+        TexturedFace,
     },
 };
 
 pub(super) const MAGIC: [u8; 8] = *b"rtfarm\r\n";
 
 /// The version changes with the layout or the meaning of any byte.
-pub(super) const VERSION: u32 = 9;
+pub(super) const VERSION: u32 = 10;
 
 /// This number reads differently on a machine of the other byte order.
 pub(super) const BYTE_ORDER: u32 = 0x0102_0304;
@@ -57,6 +59,10 @@ macro_rules! sections {
 
         const SECTIONS: usize = [$(stringify!($name)),*].len();
 
+        /// The names of the sections, in their order.
+        #[doc(hidden)]
+        pub const SECTION_NAMES: [&str; SECTIONS] = [$(stringify!($name)),*];
+
         /// The record sizes of the sections, in their order.
         pub(super) const RECORD_SIZES: [usize; SECTIONS] = [$(size_of::<$record>()),*];
 
@@ -75,10 +81,11 @@ macro_rules! sections {
 
 sections! {
     nodes: Node,
-    items: Item,
+    compact_nodes: CompactNode,
+    faces: FaceRecord,
     vertices: [f64; 3],
-    triangles: TriangleRecord,
-    coplanars: CoplanarRecord,
+    single_vertices: [f32; 3],
+    coats: Coat,
     quadrangles: QuadrangleRecord,
     spheres: SphereRecord,
     planes: PlaneRecord,
@@ -147,9 +154,59 @@ impl<'a> View<'a> {
         }
     }
 
-    /// The positions of vertices.
+    /// The items of a run, such as that of a leaf.
     #[inline(always)]
-    pub(crate) fn corners<const N: usize>(&self, vertices: &[u32; N]) -> [&'a [f64; 3]; N] {
-        vertices.map(|vertex| &self.vertices[vertex as usize])
+    pub(crate) fn items(&self, run: Range<usize>) -> impl Iterator<Item = Item> + use<'a> {
+        let first = run.start;
+        self.faces[run].iter().enumerate().map(move |(k, face)| face.item(first + k))
+    }
+
+    /// All items.
+    pub(crate) fn all_items(&self) -> impl Iterator<Item = Item> + use<'a> {
+        self.items(0..self.faces.len())
+    }
+
+    /// The plane and the material of a triangle that shares its plane.
+    #[inline(always)]
+    pub(crate) fn coat(&self, face: &FaceRecord) -> &'a Coat {
+        &self.coats[face.coat()]
+    }
+
+    /// A node of the hierarchy, which is compact or not; a compact one is expanded into `room`.
+    #[inline(always)]
+    pub(crate) fn node<'n>(&self, index: usize, room: &'n mut Option<Node>) -> &'n Node
+    where
+        'a: 'n,
+    {
+        match self.sections.nodes.get(index) {
+            Some(node) => node,
+            None => room.insert(self.compact_nodes[index].expand()),
+        }
+    }
+
+    /// How many vertices there are.
+    pub(super) fn vertex_count(&self) -> usize {
+        self.vertices.len() + self.single_vertices.len()
+    }
+
+    /// The position of a vertex: those in single precision follow the others.
+    #[inline(always)]
+    pub(crate) fn vertex(&self, vertex: u32) -> [f64; 3] {
+        let index = vertex as usize;
+        if let Some(&vertex) = self.sections.vertices.get(index) {
+            return vertex;
+        }
+        let [x, y, z] = self.single_vertices[index - self.vertices.len()];
+        [f64::from(x), f64::from(y), f64::from(z)]
+    }
+
+    /// The positions of vertices. This is a loop, as `Shear::project_all` is.
+    #[inline(always)]
+    pub(crate) fn corners<const N: usize>(&self, vertices: &[u32; N]) -> [[f64; 3]; N] {
+        let mut corners = [[0.0; 3]; N];
+        for (corner, &vertex) in corners.iter_mut().zip(vertices) {
+            *corner = self.vertex(vertex);
+        }
+        corners
     }
 }

@@ -102,7 +102,8 @@ impl Surface {
     pub(crate) const NONE: Self = Self(u32::MAX);
 }
 
-/// A face in the prepared scene: its kind in the upper 3 bits, its index among its kind below.
+/// A face in the prepared scene: its kind in the upper 3 bits, its index below: that of a triangle in
+/// the section `faces`, that of all others among their kind.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, bytemuck::Pod, bytemuck::Zeroable)]
 #[repr(transparent)]
 pub(crate) struct Item(u32);
@@ -110,7 +111,7 @@ pub(crate) struct Item(u32);
 /// The kinds of faces.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Kind {
-    /// A triangle alone in its plane.
+    /// A triangle that is alone in its plane.
     Triangle = 0,
     /// A triangle that shares its plane with other faces.
     Coplanar = 1,
@@ -127,6 +128,8 @@ impl Item {
     pub(crate) const NONE: Self = Self(u32::MAX);
     /// How many faces of one kind a scene may have.
     pub(super) const LIMIT: usize = 1 << 29;
+    /// The bits of the index.
+    const INDEX: u32 = Self::LIMIT as u32 - 1;
 
     /// A face of the given kind.
     pub(crate) fn new(kind: Kind, index: usize) -> Self {
@@ -150,27 +153,84 @@ impl Item {
     /// The index among the faces of its kind.
     #[inline(always)]
     pub(crate) fn index(self) -> usize {
-        (self.0 & (Self::LIMIT as u32 - 1)) as usize
+        (self.0 & Self::INDEX) as usize
     }
 }
 
-/// A triangle that is alone in its plane.
+/// An item of the hierarchy, in the order of its leaves: a triangle itself, or where another item's
+/// record is.
 #[derive(Debug, Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
 #[repr(C)]
-pub(crate) struct TriangleRecord {
+pub(crate) struct FaceRecord {
+    /// The vertices of a triangle. Of another item the first is its index among its kind.
     pub(crate) vertices: [u32; 3],
-    pub(crate) material: u32,
-    pub(crate) rank: u32,
+    /// The kind in the upper 3 bits, the rank of a triangle below.
+    kind_and_rank: u32,
+    /// The material of a triangle that is alone in its plane, the index of a coplanar one's coat.
+    coat: u32,
 }
 
-/// A triangle that shares its plane with other faces.
-#[derive(Debug, Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
+impl FaceRecord {
+    /// A triangle that is alone in its plane.
+    pub(crate) fn triangle(vertices: [u32; 3], material: u32, rank: u32) -> Self {
+        Self { vertices, kind_and_rank: Item::new(Kind::Triangle, rank as usize).0, coat: material }
+    }
+
+    /// A triangle that shares its plane, with the index of its coat.
+    pub(crate) fn coplanar(vertices: [u32; 3], coat: u32, rank: u32) -> Self {
+        Self { vertices, kind_and_rank: Item::new(Kind::Coplanar, rank as usize).0, coat }
+    }
+
+    /// An item of another kind.
+    pub(crate) fn of(kind: Kind, index: usize) -> Self {
+        let vertices = [index as u32, 0, 0];
+        Self { vertices, kind_and_rank: Item::new(kind, 0).0, coat: 0 }
+    }
+
+    /// The item at this place in the section `faces`.
+    #[inline(always)]
+    pub(crate) fn item(&self, place: usize) -> Item {
+        let kind = self.kind_and_rank & !Item::INDEX;
+        Item(
+            kind | if kind >> 29 <= Kind::Coplanar as u32 {
+                place as u32
+            } else {
+                self.vertices[0]
+            },
+        )
+    }
+
+    /// The vertices of a triangle, to be changed; `None` for another item.
+    pub(crate) fn triangle_vertices(&mut self) -> Option<&mut [u32; 3]> {
+        let is_triangle = self.kind_and_rank >> 29 <= Kind::Coplanar as u32;
+        is_triangle.then_some(&mut self.vertices)
+    }
+
+    /// The rank of a triangle.
+    #[inline(always)]
+    pub(crate) fn rank(&self) -> u32 {
+        self.kind_and_rank & Item::INDEX
+    }
+
+    /// The material of a triangle that is alone in its plane.
+    #[inline(always)]
+    pub(crate) fn material(&self) -> u32 {
+        self.coat
+    }
+
+    /// The index of a coplanar triangle's coat.
+    #[inline(always)]
+    pub(crate) fn coat(&self) -> usize {
+        self.coat as usize
+    }
+}
+
+/// The plane and the material of triangles that share their plane with other faces.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, bytemuck::Pod, bytemuck::Zeroable)]
 #[repr(C)]
-pub(crate) struct CoplanarRecord {
-    pub(crate) vertices: [u32; 3],
-    pub(crate) material: u32,
-    pub(crate) rank: u32,
+pub(crate) struct Coat {
     pub(crate) plane: PlaneIndex,
+    pub(crate) material: u32,
 }
 
 /// A quadrangle. Its plane is recorded even where no other face shares it.
@@ -388,7 +448,7 @@ pub(crate) struct PlaneRecord {
 }
 
 /// An index of a plane; bit 31 says that the face looks the other way.
-#[derive(Debug, Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, bytemuck::Pod, bytemuck::Zeroable)]
 #[repr(transparent)]
 pub(crate) struct PlaneIndex(u32);
 

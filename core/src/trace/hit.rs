@@ -90,12 +90,8 @@ pub(super) fn take_quadrangle(view: &View<'_>, item: Item, t: f64, hit: &mut Hit
 fn meet(view: &View<'_>, ray: &Ray, shear: &Shear, item: Item) -> Option<(f64, u32, Part)> {
     let index = item.index();
     let (t, rank) = match item.kind()? {
-        Kind::Triangle => {
-            let corners = shear.project_all(view.corners(&view.triangles[index].vertices));
-            return meet_triangle(view, ray, item, hit_triangle(corners)?);
-        }
-        Kind::Coplanar => {
-            let corners = shear.project_all(view.corners(&view.coplanars[index].vertices));
+        Kind::Triangle | Kind::Coplanar => {
+            let corners = shear.project_all(&view.corners(&view.faces[index].vertices));
             return meet_triangle(view, ray, item, hit_triangle(corners)?);
         }
         Kind::Quadrangle => {
@@ -103,7 +99,7 @@ fn meet(view: &View<'_>, ray: &Ray, shear: &Shear, item: Item) -> Option<(f64, u
             if ray.leaving == face.plane.surface() && face.rank <= ray.after {
                 return None;
             }
-            let corners = shear.project_all(view.corners(&face.vertices));
+            let corners = shear.project_all(&view.corners(&face.vertices));
             return if is_inside(&corners) { meet_quadrangle(view, ray, item) } else { None };
         }
         Kind::Sphere => {
@@ -143,7 +139,7 @@ fn meet_quadrangle(view: &View<'_>, ray: &Ray, item: Item) -> Option<(f64, u32, 
     let [point, normal] = [plane.point, plane.normal].map(DVec3::from_array);
     let t = hit_plane(ray, point, normal).unwrap_or_else(|| {
         let shear = Shear::new(ray.origin, ray.direction);
-        hit_chord(&shear.project_all(view.corners(&face.vertices)))
+        hit_chord(&shear.project_all(&view.corners(&face.vertices)))
     });
     (t > 0.0).then_some((t, face.rank, Part::WHOLE))
 }
@@ -151,22 +147,22 @@ fn meet_quadrangle(view: &View<'_>, ray: &Ray, item: Item) -> Option<(f64, u32, 
 /// The same for a triangle that the ray crosses at a distance `t`, before or behind its start.
 #[inline(always)]
 fn meet_triangle(view: &View<'_>, ray: &Ray, item: Item, t: f64) -> Option<(f64, u32, Part)> {
-    let index = item.index();
-    let (t, rank) = if item.kind() == Some(Kind::Triangle) {
-        let face = &view.triangles[index];
-        if ray.leaving == Surface(face.rank) {
+    let face = &view.faces[item.index()];
+    let rank = face.rank();
+    let t = if item.kind() == Some(Kind::Triangle) {
+        if ray.leaving == Surface(rank) {
             return None;
         }
-        (t, face.rank)
+        t
     } else {
-        let face = &view.coplanars[index];
-        if ray.leaving == face.plane.surface() {
-            return (face.rank > ray.after).then_some((0.0, face.rank, Part::WHOLE));
+        let plane = view.coat(face).plane;
+        if ray.leaving == plane.surface() {
+            return (rank > ray.after).then_some((0.0, rank, Part::WHOLE));
         }
         // The plane's distance, not this triangle's: coincident faces are met at one place.
-        let plane = &view.planes[face.plane.index()];
+        let plane = &view.planes[plane.index()];
         let [point, normal] = [plane.point, plane.normal].map(DVec3::from_array);
-        (hit_plane(ray, point, normal).unwrap_or(t), face.rank)
+        hit_plane(ray, point, normal).unwrap_or(t)
     };
     (t > 0.0).then_some((t, rank, Part::WHOLE))
 }

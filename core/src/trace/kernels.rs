@@ -284,8 +284,7 @@ mod tests {
                     plain
                 });
                 let shear = Shear::new(ray.origin, ray.direction);
-                let [a, b, c] = &corners;
-                let t = hit_triangle(shear.project_all([a, b, c])).map(f64::to_bits);
+                let t = hit_triangle(shear.project_all(&corners)).map(f64::to_bits);
                 let is = |mask: u64| mask >> k & 1 == 1;
                 if is(found.crossings.certain) {
                     assert_eq!(found.distances[k], t, "{ray:?}");

@@ -290,7 +290,7 @@ pub(super) fn cross(
         let mut possible = 0;
         for (lane, distance) in distances[k].iter_mut().enumerate() {
             let shear = shear_at(group, lane, [0, 1, 2]);
-            let [a, b, c] = shear.project_all([&corners[0], &corners[1], &corners[2]]);
+            let [a, b, c] = shear.project_all(corners);
             let over = [edge(&b, &c), edge(&c, &a), edge(&a, &b)];
             let is_any = |is: fn(f64) -> bool| over.into_iter().any(is);
             if is_any(|w| w < 0.0) && is_any(|w| w > 0.0) {

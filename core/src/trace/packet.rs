@@ -170,11 +170,10 @@ impl Packet {
         meeting: &mut impl Meeting,
     ) {
         let mut is_changed = false;
-        for &item in &view.items[leaf.items()] {
+        for item in view.items(leaf.items()) {
             let mask = mask & self.alive;
             let vertices = match item.kind() {
-                Some(Kind::Triangle) => &view.triangles[item.index()].vertices,
-                Some(Kind::Coplanar) => &view.coplanars[item.index()].vertices,
+                Some(Kind::Triangle | Kind::Coplanar) => &view.faces[item.index()].vertices,
                 Some(Kind::Sphere) if meeting.is_plain(item) => {
                     is_changed |= self.meet_sphere(view, (item, mask), meeting);
                     continue;
@@ -368,7 +367,8 @@ pub(super) fn visit_packet(
             }
             packet.shorten_beam();
         } else {
-            let node = &view.nodes[current.node()];
+            let room = &mut None;
+            let node = view.node(current.node(), room);
             let (nears, mut met) = kernel.meet_beam(node, &packet.beam);
             let first = waiting;
             while met != 0 {

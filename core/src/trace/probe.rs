@@ -62,13 +62,12 @@ impl FaceTests {
     fn add(&mut self, view: &View<'_>, shear: &Shear, item: Item) {
         let mut is_in_doubt = false;
         let index = item.index();
-        let project = |corner| shear.project(corner);
+        let project = |corner: [f64; 3]| shear.project(&corner);
         let mut test_triangle = |vertices| {
             hit_triangle_in_doubt(view.corners(vertices).map(project), &mut is_in_doubt);
         };
         match item.kind() {
-            Some(Kind::Triangle) => test_triangle(&view.triangles[index].vertices),
-            Some(Kind::Coplanar) => test_triangle(&view.coplanars[index].vertices),
+            Some(Kind::Triangle | Kind::Coplanar) => test_triangle(&view.faces[index].vertices),
             Some(Kind::Quadrangle) => {
                 let corners = view.corners(&view.quadrangles[index].vertices).map(project);
                 is_inside_in_doubt(&corners, &mut is_in_doubt);
@@ -116,7 +115,7 @@ impl<B: AsRef<[u8]>> Probing for PreparedScene<B> {
             let ray = to_ray(&view, probe);
             let mut nearest = Nearest::new(&ray);
             let box_ray = BoxRay::new(ray.origin, ray.direction, ray.reach, &view.header.frame);
-            for &item in view.items {
+            for item in view.all_items() {
                 nearest.meet(&view, ScalarBoxes, &box_ray, item, &mut scratch);
             }
             from_hit(&view, &nearest.hit)
@@ -189,7 +188,7 @@ fn to_ray(view: &View<'_>, probe: &Probe) -> Ray {
     let leaving = probe.leaving.and_then(|(primitive, face)| {
         let first = view.first_ranks.get(primitive as usize).copied().unwrap_or(primitive);
         let rank = first + face;
-        view.items.iter().find_map(|&item| {
+        view.all_items().find_map(|item| {
             let face = match item.kind() {
                 Some(Kind::Solid) => {
                     Face { item, part: Part::with_rank(&view.solids[item.index()], rank)? }

@@ -132,7 +132,7 @@ impl Shear {
     /// Projects every vertex. This is a loop, since the closure of a `map` is called where a kernel is compiled for
     /// an instruction set.
     #[inline(always)]
-    pub(super) fn project_all<const N: usize>(&self, vertices: [&[f64; 3]; N]) -> [Projected; N] {
+    pub(super) fn project_all<const N: usize>(&self, vertices: &[[f64; 3]; N]) -> [Projected; N] {
         let mut projected = [Projected { x: 0.0, y: 0.0, z: 0.0 }; N];
         for (projected, vertex) in projected.iter_mut().zip(vertices) {
             *projected = self.project(vertex);

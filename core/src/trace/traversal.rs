@@ -70,7 +70,7 @@ pub(super) fn visit_from(
     let mut waiting = 0;
     loop {
         if current.is_leaf() {
-            for &item in &view.items[current.items()] {
+            for item in view.items(current.items()) {
                 match meet(item, box_ray) {
                     Step::Past => {}
                     Step::On(reach) => box_ray.shorten(reach),
@@ -79,7 +79,8 @@ pub(super) fn visit_from(
             }
         } else {
             enter();
-            let node = &view.nodes[current.node()];
+            let room = &mut None;
+            let node = view.node(current.node(), room);
             let (distances, mut mask) = kernel.test(node, box_ray);
             let first = waiting;
             while mask != 0 {

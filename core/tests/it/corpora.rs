@@ -55,7 +55,7 @@ fn prepared_scenes_with_changed_bytes_hold() {
 fn prepared_scenes_with_a_few_words_changed_anywhere_hold() {
     for seed in 0..3000 {
         let mut random = Random::new(seed);
-        let mut input = vec![random.below(3) as u8];
+        let mut input = vec![random.below(8) as u8];
         for _ in 0..4 * (1 + random.below(3)) {
             input.push(random.bits() as u8);
         }

@@ -11,37 +11,20 @@ use rtfarm_core::{
     prepared::{PreparedBytes, PreparedError, PreparedScene},
     render::{Quality, Sampling, Settings, render_tile},
     scene::{Scene, Texture},
+    testing::SECTION_NAMES,
     tile::Size,
 };
 
 use crate::support::{
+    block::{entry, hash_again, number, section},
     parts::{join, sphere, upright},
     studio::{read, whole},
 };
 
-/// Where the table of sections begins, behind the hash of all that follows it.
-const TABLE: usize = 8 + 4 + 4 + 32;
-
 /// The sections that tell where light is sent on, and those of textures.
-const GATHERING: std::ops::Range<usize> = 15..17;
-const TEXTURES: std::ops::Range<usize> = 17..22;
-
-/// The hash of the block is that of these bytes again.
-fn hash_again(block: &mut [u8]) {
-    let hash = blake3::hash(&block[TABLE..]);
-    block[TABLE - 32..TABLE].copy_from_slice(hash.as_bytes());
-}
-
-fn number(block: &[u8], at: usize) -> usize {
-    u64::from_le_bytes(block[at..at + 8].try_into().unwrap()) as usize
-}
-
-/// The bytes of a section, and of the gap that follows it.
-fn section(block: &[u8], index: usize) -> std::ops::Range<usize> {
-    let start = |index: usize| number(block, TABLE + 16 * index);
-    let end = if index + 1 < TEXTURES.end { start(index + 1) } else { block.len() };
-    start(index)..end
-}
+const GATHERING: [&str; 2] = ["emitters", "emitter_nodes"];
+const TEXTURES: [&str; 5] =
+    ["textured_faces", "textures", "texture_levels", "fine_texels", "coarse_texels"];
 
 /// More faces that send light on than are looked at one by one, two of them with a texture.
 fn scene() -> Scene {
@@ -117,14 +100,14 @@ fn damages(was: [u8; 8]) -> impl Iterator<Item = Vec<u8>> + use<> {
     words.chain(reals)
 }
 
-/// Every word of these sections, changed in every way.
-fn check_damaged_words(sections: std::ops::Range<usize>) {
+/// Every word of these sections of the scene, changed in every way.
+fn check_damaged_words(sections: &[&str]) {
     let block = prepare(&scene()).unwrap();
     let block = block.as_ref();
     assert!(is_taken(block, "the scene itself"));
-    for index in sections {
-        let bytes = section(block, index);
-        assert!(!bytes.is_empty(), "section {index} is to hold something");
+    for name in sections {
+        let bytes = section(block, name);
+        assert!(!bytes.is_empty(), "section {name} is to hold something");
         let taken: Vec<bool> = bytes
             .step_by(4)
             .par_bridge()
@@ -137,41 +120,41 @@ fn check_damaged_words(sections: std::ops::Range<usize>) {
                     let end = (at + damage.len()).min(damaged.len());
                     damaged[at..end].copy_from_slice(&damage[..end - at]);
                     hash_again(&mut damaged);
-                    is_taken(&damaged, &format!("section {index}, byte {at}: {damage:?}"))
+                    is_taken(&damaged, &format!("section {name}, byte {at}: {damage:?}"))
                 })
             })
             .collect();
         let count = taken.iter().filter(|&&is_taken| is_taken).count();
-        eprintln!("section {index}: {count} of {} damages give a picture", taken.len());
+        eprintln!("section {name}: {count} of {} damages give a picture", taken.len());
     }
 }
 
 #[test]
 fn damage_to_what_sends_light_on_is_refused_or_gives_a_picture() {
-    check_damaged_words(GATHERING);
+    check_damaged_words(&GATHERING);
 }
 
 #[test]
 fn damage_to_textures_is_refused_or_gives_a_picture() {
-    check_damaged_words(TEXTURES);
+    check_damaged_words(&TEXTURES);
 }
 
 #[test]
 fn sections_of_another_place_or_length_are_refused_or_give_a_picture() {
     let block = prepare(&scene()).unwrap();
     let block = block.as_ref();
-    for index in GATHERING.start..TEXTURES.end {
-        let place = TABLE + 16 * index;
+    for name in GATHERING.into_iter().chain(TEXTURES) {
+        let place = entry(name);
         for at in [place, place + 8] {
             let was = number(block, at) as u64;
-            let other_places = (0..TEXTURES.end).map(|k| number(block, TABLE + 16 * k) as u64);
+            let other_places = SECTION_NAMES.iter().map(|name| number(block, entry(name)) as u64);
             let near = [0, 1, was.wrapping_sub(1), was + 1, was + 64, 2 * was, block.len() as u64];
             let far = [1 << 32, 1 << 40, u64::MAX / 64, u64::MAX / 2, u64::MAX - 63, u64::MAX];
             for value in other_places.chain(near).chain(far) {
                 let mut damaged = block.to_vec();
                 damaged[at..at + 8].copy_from_slice(&value.to_le_bytes());
                 hash_again(&mut damaged);
-                is_taken(&damaged, &format!("section {index}, byte {at}: {value}"));
+                is_taken(&damaged, &format!("section {name}, byte {at}: {value}"));
             }
         }
     }

@@ -2,6 +2,7 @@
 
 mod branches;
 mod catalogue;
+mod compact;
 mod corpora;
 mod damage;
 mod edges;

@@ -38,7 +38,7 @@ impl FrustumSearch {
         let frustum = Frustum::new(screen, &view.header.frame, beam);
         while let Some(child) = self.waiting.pop() {
             if child.is_leaf() {
-                for &item in &view.items[child.items()] {
+                for item in view.items(child.items()) {
                     self.outlines.add_item(view, screen, item, beam);
                 }
                 if self.outlines.as_slice().len() > most {
@@ -46,7 +46,8 @@ impl FrustumSearch {
                 }
                 continue;
             }
-            let node = &view.nodes[child.node()];
+            let room = &mut None;
+            let node = view.node(child.node(), room);
             let mut mask = frustum.boxes_met(&node.planes);
             while mask != 0 {
                 let child = node.children[mask.trailing_zeros() as usize & 7];

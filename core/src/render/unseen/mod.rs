@@ -255,7 +255,7 @@ mod tests {
                 let beam = Beam { block: Rectangle::of_block(block), deepest };
                 assert!(search.collect(&view, &screen, &beam, usize::MAX));
                 let mut all = Outlines::default();
-                view.items.iter().for_each(|&item| all.add_item(&view, &screen, item, &beam));
+                view.all_items().for_each(|item| all.add_item(&view, &screen, item, &beam));
                 assert_eq!(ranks(&search.outlines), ranks(&all), "{block:?}");
                 total += all.as_slice().len();
             }
