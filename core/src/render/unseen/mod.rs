@@ -5,7 +5,8 @@
 //! [`frustum`] collects the faces in it: boxes are filtered with a margin for rounding, then a
 //! face's own [`outline`] on the screen decides. So what a pixel learns depends neither on the tree
 //! nor on the block. The [`judge`] cuts the outlines to the pixel and keeps those that no sample
-//! has met or passed, and whose colour may lie far enough from what was seen ([`contrast`]). They
+//! has met or passed, and whose colour may lie far enough from what was seen ([`contrast`]), and the
+//! gap that the face that was seen and those beside it leave, whatever stands behind. They
 //! are the pixel's [`UnseenFaces`], and tell how much its mean may lack; later samples take them
 //! out one by one.
 //!
