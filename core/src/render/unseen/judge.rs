@@ -67,13 +67,15 @@ impl<'a> Judge<'a> {
         }
     }
 
-    /// Finds what a pixel may hide up to a depth, among the outlines of its block.
+    /// Finds what a pixel may hide up to a depth, among the outlines of its block. `around` are the first
+    /// samples of the pixels beside it that came the same way: those that passed a gap tell what is there.
     pub(super) fn find_unseen(
         &mut self,
         sight: &Sight<'_>,
         outlines: &Outlines,
         (x, y): (u32, u32),
         first: &FirstSample,
+        around: impl Iterator<Item = FirstSample>,
     ) -> UnseenFaces {
         let pixel = Rectangle::of_pixel(x, y);
         let mut unseen = UnseenFaces::default();
@@ -92,7 +94,8 @@ impl<'a> Judge<'a> {
         if suspects.len() > usize::from(own.is_some()) || !is_filled {
             let seen = self.seen(sight, first);
             if let (Some(seen), false) = (&seen, is_filled) {
-                let gap = self.find_gap(sight, (outlines, &suspects), &pixel, first, seen);
+                let faces = (outlines, &suspects[..]);
+                let gap = self.find_gap(sight, faces, &pixel, (first, seen), around);
                 gap.into_iter().for_each(|gap| unseen.add_gap(gap));
             }
             for &index in &suspects {
@@ -127,21 +130,27 @@ impl<'a> Judge<'a> {
         sight: &Sight<'_>,
         (outlines, suspects): (&Outlines, &[usize]),
         pixel: &Rectangle,
-        first: &FirstSample,
-        seen: &Surfel,
+        (first, seen): (&FirstSample, &Surfel),
+        around: impl Iterator<Item = FirstSample>,
     ) -> Option<Gap> {
         // What stands behind a face that is not in the beam is not in it either.
         if sight.screen.depth(seen.point) > sight.deepest {
             return None;
         }
-        let contrast = first.color.max(DVec3::splat(sight.weight) - first.color);
+        let passed = around.filter(|other| {
+            self.seen(sight, other).is_none_or(|other| is_behind(sight, other.point, seen))
+        });
+        let contrast = passed
+            .map(|other| (other.color - first.color).abs())
+            .reduce(DVec3::max)
+            .unwrap_or(first.color.max(DVec3::splat(sight.weight) - first.color));
         let (mut covers, mut shares) = (Vec::new(), [0.0; 2]);
         for &index in suspects {
             let outline = &outlines.as_slice()[index];
             let (corners, clipper) = (outlines.corners_of(outline), &mut self.clipper);
             let cut = Fragment::new(corners, &outline.bounds, pixel, &sight.reach, clipper);
             let Some(fragment) = cut else { continue };
-            if !is_behind(sight, &fragment, seen) {
+            if !is_behind(sight, sight.screen.point(fragment.nearest), seen) {
                 shares[usize::from(fragment.is_front)] += fragment.share;
                 covers.push(self.clipper.polygon().to_vec());
             }
@@ -175,7 +184,7 @@ impl<'a> Judge<'a> {
             return;
         }
         let screen = sight.screen;
-        if seen.is_some_and(|seen| is_behind(sight, &fragment, seen)) {
+        if seen.is_some_and(|seen| is_behind(sight, sight.screen.point(fragment.nearest), seen)) {
             return;
         }
         let point = screen.point(fragment.middle);
@@ -306,10 +315,9 @@ impl<'a> Judge<'a> {
     }
 }
 
-/// Whether a face stands behind what was seen: beyond an edge of that it may begin, but not more than a
-/// pixel behind it.
-fn is_behind(sight: &Sight<'_>, fragment: &Fragment, seen: &Surfel) -> bool {
-    let nearest = sight.screen.point(fragment.nearest);
-    let pixel_side = sight.screen.pixel_side() / fragment.nearest[2];
-    seen.normal.dot(nearest - seen.point) < -pixel_side
+/// Whether a face that begins at `point` stands behind what was seen: beyond an edge of that it may begin,
+/// but not more than a pixel behind it.
+fn is_behind(sight: &Sight<'_>, point: DVec3, seen: &Surfel) -> bool {
+    let pixel_side = sight.screen.pixel_side() * sight.screen.depth(point);
+    seen.normal.dot(point - seen.point) < -pixel_side
 }
