@@ -13,7 +13,7 @@ use rtfarm_core::{
 };
 use rtfarm_oracle::{
     hard_case::{HardCase, few_rays},
-    known_pictures::{KnownPicture, checkerboard, known_pictures},
+    known_pictures::{KnownPicture, checkerboard, indirect_pictures, known_pictures},
 };
 
 use crate::support::studio::{prepared, read, whole};
@@ -77,6 +77,26 @@ fn fixed_samples_tell_their_error() {
 #[test]
 fn adaptive_samples_tell_their_error() {
     check_calibration(&[16.0, 8.0, 4.0, 2.0, 1.0, 0.5].map(adaptive));
+}
+
+/// One sample a pixel, whose error only the neighbours' samples tell; seeds that no factor was fitted to.
+#[test]
+fn one_sample_tells_its_error_beside_edges() {
+    let pictures = known_pictures(96).into_iter().chain(indirect_pictures(96));
+    for known in pictures.filter(|known| known.name != "checkerboard") {
+        let scene = prepared(&known.scene);
+        let mut ratios: Vec<f64> = (7000..7000 + SEEDS)
+            .map(|seed| {
+                let rendered = render(&scene, &known, adaptive(220.0), seed);
+                rendered.tally.error().unwrap() / square_error(&rendered, &known).sqrt()
+            })
+            .collect();
+        ratios.sort_by(f64::total_cmp);
+        let [low, median, high] = [ratios[0], ratios[ratios.len() / 2], ratios[15]];
+        eprintln!("{}: {low:.2} .. {median:.2} .. {high:.2}", known.name);
+        assert!((0.8..=1.25).contains(&median), "{}: {median}", known.name);
+        assert!(low >= 0.5 && high <= 2.0, "{}: {low} .. {high}", known.name);
+    }
 }
 
 #[test]

@@ -287,6 +287,50 @@ fn lines_on_a_wall_are_in_the_adaptive_picture() {
     }
 }
 
+/// Slits in a fan between blue covers at z = -1, and the red wall behind: the text and the light.
+fn slits(width: f64) -> (String, f64) {
+    // Left and right ends of each slit, below and above, and beyond the frame on both sides.
+    let mut sides = vec![[-9.0, -9.0]];
+    let mut light = 0.0;
+    for k in 0..12 {
+        let (x, dx) = (-1.8 + 0.2 * f64::from(k), 0.01 * f64::from(k * k));
+        // As wide across as a wire is.
+        let half = width * PIXEL / 2.0 * (dx * dx + 2.6 * 2.6).sqrt() / 2.6;
+        let [below, above] = [x - 0.2 * dx / 2.6, x + dx + 0.2 * dx / 2.6];
+        sides.extend([[below - half, above - half], [below + half, above + half]]);
+        // The frame is 3 high.
+        light += 3.0 * 2.0 * half / (PIXEL * PIXEL);
+    }
+    sides.push([9.0, 9.0]);
+    let mut text = square(-2.0, "red");
+    for pair in sides.chunks_exact(2) {
+        let [[a, b], [c, d]] = [pair[0], pair[1]];
+        text += "quadrangle ";
+        for (x, y) in [(a, -1.5), (c, -1.5), (d, 1.5), (b, 1.5)] {
+            write!(text, "vertex {} {} -1 ", x * 1.2, y * 1.2).unwrap();
+        }
+        text += "material blue endquadrangle\n";
+    }
+    (text, light)
+}
+
+#[test]
+fn light_through_slits_is_in_the_adaptive_picture_and_its_error_is_told() {
+    for width in WIDTHS {
+        let (text, light) = slits(width);
+        let scene = lit_scene(&text);
+        check(&format!("slits of {width}"), &scene, 0, light, 0.05);
+        let [tile, truth] = [adaptive(), Sampling::fixed(2048).unwrap()]
+            .map(|sampling| render(&scene, sampling, whole(frame()), Isa::fastest()));
+        let pairs = tile.pixels.as_flattened().iter().zip(truth.pixels.as_flattened());
+        let squares: f64 = pairs.map(|(a, b)| (f64::from(*a) - f64::from(*b)).powi(2)).sum();
+        let error = (squares / (3.0 * frame().pixel_count() as f64)).sqrt();
+        let told = tile.tally.error().unwrap() / error;
+        eprintln!("slits of {width}: {:.2}/255 off, told over true {told:.2}", 255.0 * error);
+        assert!((0.5..=2.0).contains(&told), "{width}: {told}");
+    }
+}
+
 #[test]
 fn wires_before_a_fine_mesh_are_in_the_adaptive_picture() {
     // Ten rows of facets in each pixel.

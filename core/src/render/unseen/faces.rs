@@ -14,6 +14,7 @@ pub(in crate::render) struct UnseenFaces {
     faces: Vec<UnseenFace>,
     /// The corners of all faces.
     corners: Vec<Corner>,
+    gaps: Vec<Gap>,
     /// How far, channel by channel, the colour of faces that were too many to be looked at may lie
     /// from that of the pixel; 0 where there were not too many.
     uncounted_contrast: DVec3,
@@ -34,6 +35,17 @@ struct UnseenFace {
     surfel: Surfel,
 }
 
+/// What faces that were seen, and those that continue them, leave uncovered.
+#[derive(Debug)]
+pub(super) struct Gap {
+    /// What these faces cover of the pixel.
+    pub(super) covers: Vec<Vec<Corner>>,
+    /// The share of the pixel that they leave, 0..=1.
+    pub(super) share: f64,
+    /// How far what is seen through it may lie from the colour of the pixel, channel by channel.
+    pub(super) contrast: DVec3,
+}
+
 impl UnseenFaces {
     /// Faces that are too many to be looked at: they may cover any share of the pixel.
     pub(super) fn uncounted(contrast: DVec3) -> Self {
@@ -42,7 +54,7 @@ impl UnseenFaces {
 
     /// Whether nothing may hide.
     pub(in crate::render) fn is_empty(&self) -> bool {
-        self.faces.is_empty() && self.uncounted_contrast == DVec3::ZERO
+        self.faces.is_empty() && self.gaps.is_empty() && self.uncounted_contrast == DVec3::ZERO
     }
 
     /// Estimates the expected square of what the mean of `count` samples lacks, channel by channel:
@@ -56,8 +68,12 @@ impl UnseenFaces {
             shares[side] += face.share;
             lacks[side] += face.share * face.contrast;
         }
-        let share = shares[0].max(shares[1]);
-        let lack = lacks[0].max(lacks[1]) / share.max(1.0);
+        let (mut share, mut lack) = (shares[0].max(shares[1]), lacks[0].max(lacks[1]));
+        for gap in &self.gaps {
+            share += gap.share;
+            lack += gap.share * gap.contrast;
+        }
+        let lack = lack / share.max(1.0);
         let n = f64::from(count);
         lack * lack * power(1.0 - share.min(1.0), count)
             + self.uncounted_contrast * self.uncounted_contrast * (UNSEEN / (n * n * n))
@@ -70,6 +86,7 @@ impl UnseenFaces {
         let moved =
             other.faces.into_iter().map(|face| UnseenFace { first: face.first + first, ..face });
         self.faces.extend(moved);
+        self.gaps.extend(other.gaps);
         self.uncounted_contrast = self.uncounted_contrast.max(other.uncounted_contrast);
     }
 
@@ -94,6 +111,16 @@ impl UnseenFaces {
             contrast,
             surfel,
         });
+    }
+
+    /// Adds a gap.
+    pub(super) fn add_gap(&mut self, gap: Gap) {
+        self.gaps.push(gap);
+    }
+
+    /// Takes out the gaps that a place on the screen lies in.
+    pub(super) fn remove_gaps_at(&mut self, place: [f64; 2]) {
+        self.gaps.retain(|gap| gap.covers.iter().any(|cover| contains(cover, place)));
     }
 
     /// Takes out a face that covers a place on the screen.

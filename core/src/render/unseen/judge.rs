@@ -4,8 +4,8 @@ use glam::DVec3;
 
 use super::{
     contrast::{Contrasts, Surfel},
-    faces::UnseenFaces,
-    outline::{Clipper, Fragment, Outline, Outlines, contains},
+    faces::{Gap, UnseenFaces},
+    outline::{Clipper, Fragment, Outline, Outlines, contains, fills},
     screen::{Reach, Rectangle, Screen},
 };
 use crate::{prepared::layout::View, trace::ray::Hit};
@@ -67,13 +67,15 @@ impl<'a> Judge<'a> {
         }
     }
 
-    /// Finds what a pixel may hide up to a depth, among the outlines of its block.
+    /// Finds what a pixel may hide up to a depth, among the outlines of its block. `around` are the first
+    /// samples of the pixels beside it that came the same way: those that passed a gap tell what is there.
     pub(super) fn find_unseen(
         &mut self,
         sight: &Sight<'_>,
         outlines: &Outlines,
         (x, y): (u32, u32),
         first: &FirstSample,
+        around: impl Iterator<Item = FirstSample>,
     ) -> UnseenFaces {
         let pixel = Rectangle::of_pixel(x, y);
         let mut unseen = UnseenFaces::default();
@@ -81,16 +83,27 @@ impl<'a> Judge<'a> {
         suspects.clear();
         suspects.extend((0..outlines.as_slice().len()).filter(|&index| {
             let outline = &outlines.as_slice()[index];
-            outline.nearest <= sight.deepest
-                && outline.bounds.overlaps(&pixel)
-                && first.hit.rank != outline.rank
+            outline.nearest <= sight.deepest && outline.bounds.overlaps(&pixel)
         }));
-        if !suspects.is_empty() {
-            suspects.sort_unstable_by_key(|&index| outlines.as_slice()[index].rank);
+        suspects.sort_unstable_by_key(|&index| outlines.as_slice()[index].rank);
+        let own = suspects
+            .iter()
+            .map(|&index| &outlines.as_slice()[index])
+            .find(|outline| outline.rank == first.hit.rank);
+        let is_filled = own.is_none_or(|own| fills(outlines.corners_of(own), &pixel));
+        if suspects.len() > usize::from(own.is_some()) || !is_filled {
             let seen = self.seen(sight, first);
+            if let (Some(seen), false) = (&seen, is_filled) {
+                let faces = (outlines, &suspects[..]);
+                let gap = self.find_gap(sight, faces, &pixel, (first, seen), around);
+                gap.into_iter().for_each(|gap| unseen.add_gap(gap));
+            }
             for &index in &suspects {
                 let outline = &outlines.as_slice()[index];
-                self.judge(sight, (outlines, outline), &pixel, (first, seen.as_ref()), &mut unseen);
+                let met = (first, seen.as_ref());
+                if first.hit.rank != outline.rank {
+                    self.judge(sight, (outlines, outline), &pixel, met, &mut unseen);
+                }
             }
             self.drop_negligible(&mut unseen, 1);
         }
@@ -108,6 +121,42 @@ impl<'a> Judge<'a> {
             let material = hit.face.material_index(self.view);
             Surfel::new(screen, sight.beam, material, normal, point)
         })
+    }
+
+    /// Finds what the face that was seen and those that continue it leave uncovered. `suspects` are all
+    /// faces in the pixel, in the order of their ranks.
+    fn find_gap(
+        &mut self,
+        sight: &Sight<'_>,
+        (outlines, suspects): (&Outlines, &[usize]),
+        pixel: &Rectangle,
+        (first, seen): (&FirstSample, &Surfel),
+        around: impl Iterator<Item = FirstSample>,
+    ) -> Option<Gap> {
+        // What stands behind a face that is not in the beam is not in it either.
+        if sight.screen.depth(seen.point) > sight.deepest {
+            return None;
+        }
+        let passed = around.filter(|other| {
+            self.seen(sight, other).is_none_or(|other| is_behind(sight, other.point, seen))
+        });
+        let contrast = passed
+            .map(|other| (other.color - first.color).abs())
+            .reduce(DVec3::max)
+            .unwrap_or(first.color.max(DVec3::splat(sight.weight) - first.color));
+        let (mut covers, mut shares) = (Vec::new(), [0.0; 2]);
+        for &index in suspects {
+            let outline = &outlines.as_slice()[index];
+            let (corners, clipper) = (outlines.corners_of(outline), &mut self.clipper);
+            let cut = Fragment::new(corners, &outline.bounds, pixel, &sight.reach, clipper);
+            let Some(fragment) = cut else { continue };
+            if !is_behind(sight, sight.screen.point(fragment.nearest), seen) {
+                shares[usize::from(fragment.is_front)] += fragment.share;
+                covers.push(self.clipper.polygon().to_vec());
+            }
+        }
+        let share = 1.0 - shares[0].max(shares[1]);
+        (!self.is_negligible(share, contrast)).then_some(Gap { covers, share, contrast })
     }
 
     /// Adds a face to what a pixel may hide, unless it shows nothing new there, is hidden or has
@@ -135,11 +184,7 @@ impl<'a> Judge<'a> {
             return;
         }
         let screen = sight.screen;
-        // Beyond an edge of what is seen a face may begin, but not more than a pixel behind it.
-        let nearest = screen.point(fragment.nearest);
-        let pixel_side = screen.pixel_side() / fragment.nearest[2];
-        let is_behind = |seen: &Surfel| seen.normal.dot(nearest - seen.point) < -pixel_side;
-        if seen.is_some_and(is_behind) {
+        if seen.is_some_and(|seen| is_behind(sight, sight.screen.point(fragment.nearest), seen)) {
             return;
         }
         let point = screen.point(fragment.middle);
@@ -254,6 +299,7 @@ impl<'a> Judge<'a> {
         count: u32,
     ) {
         for place in places {
+            unseen.remove_gaps_at(place);
             while let Some(passed) = unseen.remove_at(place) {
                 unseen.limit_contrasts(|face| self.contrasts.between(face, &passed));
             }
@@ -267,4 +313,11 @@ impl<'a> Judge<'a> {
             *unseen = UnseenFaces::default();
         }
     }
+}
+
+/// Whether a face that begins at `point` stands behind what was seen: beyond an edge of that it may begin,
+/// but not more than a pixel behind it.
+fn is_behind(sight: &Sight<'_>, point: DVec3, seen: &Surfel) -> bool {
+    let pixel_side = sight.screen.pixel_side() * sight.screen.depth(point);
+    seen.normal.dot(point - seen.point) < -pixel_side
 }

@@ -5,7 +5,8 @@
 //! [`frustum`] collects the faces in it: boxes are filtered with a margin for rounding, then a
 //! face's own [`outline`] on the screen decides. So what a pixel learns depends neither on the tree
 //! nor on the block. The [`judge`] cuts the outlines to the pixel and keeps those that no sample
-//! has met or passed, and whose colour may lie far enough from what was seen ([`contrast`]). They
+//! has met or passed, and whose colour may lie far enough from what was seen ([`contrast`]), and the
+//! gap that the face that was seen and those beside it leave, whatever stands behind. They
 //! are the pixel's [`UnseenFaces`], and tell how much its mean may lack; later samples take them
 //! out one by one.
 //!
@@ -51,6 +52,7 @@ const CROWDED_CLEARANCE: f64 = 8.0;
 /// The search for what pixels may hide.
 pub(super) struct UnseenSearch<'a> {
     view: &'a View<'a>,
+    frame: Size,
     screen: Screen,
     frustum_search: FrustumSearch,
     judge: Judge<'a>,
@@ -64,16 +66,16 @@ impl<'a> UnseenSearch<'a> {
     /// no beam.
     pub(super) fn new(
         view: &'a View<'a>,
-        size: Size,
+        frame: Size,
         flat: bool,
         error: f64,
         isa: Isa,
     ) -> Option<Self> {
-        let screen = Screen::new(&view.header.camera, size)?;
+        let screen = Screen::new(&view.header.camera, frame)?;
         let judge = Judge::new(view, flat, error);
         let frustum_search = FrustumSearch::default();
         let onward = OnwardSearch::new(view, flat, isa);
-        Some(Self { view, screen, frustum_search, judge, onward })
+        Some(Self { view, frame, screen, frustum_search, judge, onward })
     }
 
     /// The rays that the search has traced.
@@ -108,7 +110,7 @@ impl<'a> UnseenSearch<'a> {
     ) {
         let Some((&(side, most), smaller)) = sizes.split_first() else {
             let (x, y) = (area.x0(), area.y0());
-            return self.search_crowded(x, y, &first_sample(x, y), on_found);
+            return self.search_crowded((x, y), &first_sample(x, y), first_sample, on_found);
         };
         for block in area.blocks(side) {
             let deepest = block
@@ -122,7 +124,8 @@ impl<'a> UnseenSearch<'a> {
             }
             for (x, y) in block.pixels() {
                 let first = first_sample(x, y);
-                let unseen = self.find_unseen(x, y, &first, self.deepest(x, y, &first.hit));
+                let unseen =
+                    self.find_unseen((x, y), &first, self.deepest(x, y, &first.hit), first_sample);
                 if !unseen.is_empty() {
                     on_found(x, y, unseen);
                 }
@@ -134,9 +137,9 @@ impl<'a> UnseenSearch<'a> {
     /// If these are too many as well, nobody knows which share of the pixel they cover.
     fn search_crowded(
         &mut self,
-        x: u32,
-        y: u32,
+        (x, y): (u32, u32),
         first: &FirstSample,
+        first_sample: &impl Fn(u32, u32) -> FirstSample,
         on_found: &mut impl FnMut(u32, u32, UnseenFaces),
     ) {
         let middle = self.screen.pixel_direction(x, y).length();
@@ -144,7 +147,7 @@ impl<'a> UnseenSearch<'a> {
         let deepest = first.hit.t / middle * clearance;
         let beam = Beam { block: Rectangle::of_pixel(x, y), deepest };
         let unseen = if self.frustum_search.collect(self.view, &self.screen, &beam, MOST_FACES) {
-            self.find_unseen(x, y, first, deepest)
+            self.find_unseen((x, y), first, deepest, first_sample)
         } else {
             UnseenFaces::uncounted(first.color.max(DVec3::ONE - first.color))
         };
@@ -158,10 +161,19 @@ impl<'a> UnseenSearch<'a> {
         DEPTH_RATIO * hit.t / self.screen.pixel_direction(x, y).length()
     }
 
-    fn find_unseen(&mut self, x: u32, y: u32, first: &FirstSample, deepest: f64) -> UnseenFaces {
+    fn find_unseen(
+        &mut self,
+        (x, y): (u32, u32),
+        first: &FirstSample,
+        deepest: f64,
+        first_sample: &impl Fn(u32, u32) -> FirstSample,
+    ) -> UnseenFaces {
         let screen = &self.screen;
         let sight = Sight { screen, beam: 0, reach: Reach::Whole, weight: 1.0, deepest };
-        self.judge.find_unseen(&sight, &self.frustum_search.outlines, (x, y), first)
+        let pixel = Area::new(self.frame, [x, y], [1, 1]).expect("the frame has it");
+        let around = pixel.with_rim().pixels().map(|(x, y)| first_sample(x, y));
+        let outlines = &self.frustum_search.outlines;
+        self.judge.find_unseen(&sight, outlines, (x, y), first, around)
     }
 
     /// Takes out of what a pixel may hide what its next samples, at these places in pixels on the

@@ -4,7 +4,7 @@
 //!
 //! Source: Heckbert & Hanrahan, "Beam Tracing Polygonal Objects" (1984).
 
-use std::ops::ControlFlow;
+use std::{iter, ops::ControlFlow};
 
 use glam::DVec3;
 
@@ -306,7 +306,7 @@ impl<'a> OnwardSearch<'a> {
             let reach = Reach::Behind(*sheet);
             let sight = Sight { screen, beam: self.beam, reach, weight: look.weight, deepest };
             let outlines = &tools.frustum_search.outlines;
-            let unseen = tools.judge.find_unseen(&sight, outlines, (x, y), first);
+            let unseen = tools.judge.find_unseen(&sight, outlines, (x, y), first, iter::empty());
             if !unseen.is_empty() {
                 (tools.on_found)(x, y, unseen);
             }
