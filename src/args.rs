@@ -384,6 +384,7 @@ pub(crate) struct PictureArgs {
 }
 
 #[derive(Debug, ClapArgs)]
+#[expect(clippy::struct_excessive_bools, reason = "each is an option")]
 pub(crate) struct RenderArgs {
     #[command(flatten)]
     pub(crate) picture: PictureArgs,
@@ -451,6 +452,13 @@ pub(crate) struct RenderArgs {
     /// Where none can be opened, the page's address is told.
     #[arg(long, help_heading = TALK)]
     pub(crate) show: bool,
+
+    /// Draw the picture in the terminal as it comes, coarsely.
+    ///
+    /// By the protocol of Kitty or iTerm2 or by sixels; a terminal that has none of them is told of, and the
+    /// picture is rendered without. With --quiet, too, and whatever `NO_COLOR` says.
+    #[arg(long, help_heading = TALK)]
+    pub(crate) preview: bool,
 
     /// How log lines are written.
     #[arg(long, value_name = "FORMAT", default_value = "text", help_heading = TALK)]

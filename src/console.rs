@@ -1,4 +1,4 @@
-//! Standard error: log lines and the progress bar, which share it.
+//! Standard error: log lines, the progress bar and a picture above it, which share it.
 
 use std::{
     io::{self, IsTerminal, Write},
@@ -22,6 +22,7 @@ use tracing_subscriber::{
 use crate::{
     args::{Args, Command, LogFormat},
     log_queue::LogQueue,
+    terminal::Drawing,
 };
 
 /// Standard error. Clones are the same one.
@@ -29,10 +30,30 @@ use crate::{
 pub(crate) struct Console {
     /// Set while a bar is on the screen; lines are then written above it.
     bar: Arc<Mutex<Option<ProgressBar>>>,
+    /// The picture that stands above the bar, at the end of all that is on the screen. It is locked while
+    /// something is written.
+    picture: Arc<Mutex<Option<Shown>>>,
     wants_bar: bool,
     is_quiet: bool,
     /// Where lines wait to be written; without it they are written at once.
     lines: Option<LogQueue>,
+}
+
+/// A picture on the screen.
+#[derive(Debug)]
+struct Shown {
+    /// Rows that it takes.
+    rows: u16,
+    /// Takes it away where clearing its rows does not.
+    erase: String,
+}
+
+impl Shown {
+    /// Moves to its first row and clears it, and all below.
+    fn clear(self) -> String {
+        let Self { rows, erase } = self;
+        format!("\r\x1b[{rows}A{erase}\x1b[J")
+    }
 }
 
 /// The longest that a process that ends waits for what it said to be read.
@@ -64,6 +85,7 @@ impl Console {
             LevelFilter::INFO
         };
         let bar = Arc::<Mutex<Option<ProgressBar>>>::default();
+        let picture = Arc::<Mutex<Option<Shown>>>::default();
         let describe = match format {
             LogFormat::Text => {
                 |count| format!(" WARN {count} lines were dropped: nobody read them\n")
@@ -74,14 +96,11 @@ impl Console {
             },
         };
         let lines = LogQueue::start(describe, {
-            let bar = Arc::clone(&bar);
-            move |line| {
-                // Its clone, so that nobody waits for the bar while the line is written.
-                let bar = bar.lock().expect("drawing never panics").clone();
-                write_above(bar.as_ref(), line);
-            }
+            let (bar, picture) = (Arc::clone(&bar), Arc::clone(&picture));
+            move |line| write_above(&bar, &picture, io::stderr(), line)
         });
-        let console = Self { bar, wants_bar: has_bar, is_quiet: *is_quiet, lines: Some(lines) };
+        let (wants_bar, is_quiet) = (has_bar, *is_quiet);
+        let console = Self { bar, picture, wants_bar, is_quiet, lines: Some(lines) };
         let filter = filter(std::env::var("RUST_LOG").ok().as_deref(), level);
         let lines = tracing_subscriber::fmt()
             .with_max_level(LevelFilter::TRACE)
@@ -102,6 +121,47 @@ impl Console {
     /// Writes a line.
     pub(crate) fn tell(&self, line: &str) {
         let _ = writeln!(self.make_writer(), "{line}");
+    }
+
+    /// Writes a line to standard output, which may be the same terminal.
+    pub(crate) fn answer(&self, line: &str) -> io::Result<()> {
+        let mut out = io::stdout();
+        if out.is_terminal() {
+            write_above(&self.bar, &self.picture, out, format!("{line}\n").as_bytes());
+            return Ok(());
+        }
+        writeln!(out, "{line}")
+    }
+
+    /// Draws a picture above the bar, in place of the one that is there.
+    pub(crate) fn draw(&self, drawing: Drawing) {
+        let Drawing { bytes, rows, erase } = drawing;
+        above(&self.bar, || {
+            let mut picture = self.picture.lock().expect("drawing never panics");
+            let mut drawn = match picture.take() {
+                // The new one covers it.
+                Some(old) if old.rows == rows => format!("\r\x1b[{rows}A"),
+                old => old.map(Shown::clear).unwrap_or_default(),
+            };
+            // Its rows come into view first, so that nothing is moved while it is drawn.
+            drawn += &"\n".repeat(rows.into());
+            let start = format!("\x1b[{rows}A\x1b7");
+            let end = format!("\x1b8\x1b[{rows}B\r");
+            let drawn = [drawn.as_bytes(), start.as_bytes(), &bytes, end.as_bytes()].concat();
+            // There is nobody to tell when standard error fails.
+            let _ = io::stderr().write_all(&drawn);
+            *picture = Some(Shown { rows, erase });
+        });
+    }
+
+    /// Whether a picture stands above the bar.
+    pub(crate) fn has_picture(&self) -> bool {
+        self.picture.lock().expect("drawing never panics").is_some()
+    }
+
+    /// Lets the picture stand where it is: what comes next is written below it.
+    pub(crate) fn leave_picture(&self) {
+        *self.picture.lock().expect("drawing never panics") = None;
     }
 
     /// Waits until all that was said is written, but not for ever.
@@ -193,16 +253,30 @@ impl<'a> MakeWriter<'a> for Console {
     }
 }
 
-/// Writes a line, above the bar if there is one.
-fn write_above(bar: Option<&ProgressBar>, line: &[u8]) {
-    // There is nobody to tell when standard error fails.
-    let write = || {
-        let _ = io::stderr().write_all(line);
-    };
+/// Does something while the bar, if there is one, is not on the screen.
+fn above(bar: &Mutex<Option<ProgressBar>>, act: impl FnOnce()) {
+    // Its clone, so that nobody waits for the bar while something is written.
+    let bar = bar.lock().expect("drawing never panics").clone();
     match bar {
-        Some(bar) => bar.suspend(write),
-        None => write(),
+        Some(bar) => bar.suspend(act),
+        None => act(),
     }
+}
+
+/// Writes a line above the bar and in place of the picture, which is drawn again later.
+fn write_above(
+    bar: &Mutex<Option<ProgressBar>>,
+    picture: &Mutex<Option<Shown>>,
+    mut out: impl Write,
+    line: &[u8],
+) {
+    above(bar, || {
+        let mut picture = picture.lock().expect("drawing never panics");
+        let mut bytes = picture.take().map(Shown::clear).unwrap_or_default().into_bytes();
+        bytes.extend_from_slice(line);
+        // There is nobody to tell when it fails.
+        let _ = out.write_all(&bytes);
+    });
 }
 
 /// Collects a line and hands it on in one piece, so that lines of several processes do not mix.
@@ -234,7 +308,7 @@ impl Drop for LineWriter {
         }
         match &self.console.lines {
             Some(lines) => lines.push(&line),
-            None => write_above(self.console.lock().clone().as_ref(), &line),
+            None => write_above(&self.console.bar, &self.console.picture, io::stderr(), &line),
         }
     }
 }

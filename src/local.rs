@@ -20,16 +20,16 @@ use tokio_util::sync::CancellationToken;
 /// A picture that outlives this process is made safe from power cuts so often.
 const SYNC_PERIOD: Duration = Duration::from_secs(1);
 
-/// Renders what `canvas` lacks besides the tiles `done`. Answers with the whole picture and how long it
-/// took, earlier processes included; `None` when `stop` came first. Never call this on the async runtime.
+/// Renders what `canvas` lacks besides the tiles `done`. Answers how long the whole picture took, earlier
+/// processes included; `None` when `stop` came first. Never call this on the async runtime.
 pub(crate) fn render(
     order: Order,
-    canvas: Canvas,
+    canvas: &Canvas,
     done: &[(TileId, TileRecord)],
     (threads, isa): (usize, Isa),
     progress: &watch::Sender<Progress>,
     stop: &CancellationToken,
-) -> anyhow::Result<Option<(Canvas, Duration)>> {
+) -> anyhow::Result<Option<Duration>> {
     let Order { prepared, settings, grid, .. } = order;
     let scene = PreparedScene::open(prepared)?;
     let pool = ThreadPoolBuilder::new().num_threads(threads).build()?;
@@ -73,7 +73,7 @@ pub(crate) fn render(
             };
             let bytes = pixel_bytes(&rendered.pixels);
             let put = canvas.put_all(&[CanvasTile { tile, bytes, record }]);
-            if let Err(error) = put.and_then(|()| sync_now_and_then(&canvas, &synced)) {
+            if let Err(error) = put.and_then(|()| sync_now_and_then(canvas, &synced)) {
                 next.store(tiles.len(), Ordering::Relaxed);
                 failure.lock().expect("nothing here panics").get_or_insert(error);
                 return;
@@ -96,7 +96,7 @@ pub(crate) fn render(
         return Err(error.into());
     }
     let is_whole = on_progress().is_continue();
-    Ok(is_whole.then(|| (canvas, elapsed())))
+    Ok(is_whole.then(elapsed))
 }
 
 /// Makes a canvas that outlives its process safe, unless that was done a moment ago or is being done.

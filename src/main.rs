@@ -15,6 +15,7 @@ mod manual;
 mod memory;
 mod output;
 mod pilot;
+mod preview;
 mod private_folder;
 mod queue;
 mod render;
@@ -26,6 +27,7 @@ mod sidecar;
 mod slurm;
 mod source;
 mod submit;
+mod terminal;
 mod verify;
 mod worker;
 

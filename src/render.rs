@@ -33,12 +33,13 @@ use crate::{
     args::{PictureArgs, RenderArgs},
     cache::{Cache, NamedFiles},
     children::{Children, Setup},
-    console::Console,
+    console::{Bar, Console},
     coordinator::UPLOAD_SILENCE,
     failure::Failure,
     local,
     output::Output,
     pilot,
+    preview::{Preview, Screen},
     private_folder::PrivateFolder,
     resume::{Begun, Resume},
     scene_files::SceneFiles,
@@ -112,8 +113,7 @@ impl Summary {
             return Ok(());
         }
         let mrays = self.tally.rays as f64 / 1e6;
-        writeln!(
-            io::stdout().lock(),
+        let line = format!(
             "{size} in {seconds:.2} s, {mrays:.1} Mrays, {rate:.1} Mrays/s, {workers} {noun}, {samples:.1} samples a pixel, {error}{depth}: {path}",
             size = self.size,
             seconds = started.elapsed().as_secs_f64(),
@@ -124,8 +124,8 @@ impl Summary {
             error = self.error_text(),
             depth = self.depth_text(),
             path = output.name().display()
-        )
-        .context("cannot write to standard output")
+        );
+        console.answer(&line).context("cannot write to standard output")
     }
 }
 
@@ -163,7 +163,7 @@ struct Rendered {
 }
 
 enum Drawn {
-    Here(Box<(Canvas, Provenance)>),
+    Here(Box<(Arc<Canvas>, Provenance)>),
     Job(Arc<Job>),
 }
 
@@ -215,6 +215,8 @@ struct Render<'a> {
     stop: &'a CancellationToken,
     /// Who has workers render; without it this process does.
     coordinator: Option<Coordinator>,
+    /// Shows pictures under way.
+    screen: Option<Screen>,
     /// When the last picture was told of, or the command began.
     told: Mutex<Instant>,
 }
@@ -243,7 +245,9 @@ pub(crate) async fn run(
         output.check()?;
         wanted.push_back((picture, output));
     }
-    let mut render = Render { args: &args, console, stop, coordinator: None, told: started.into() };
+    let screen = if args.preview { Screen::open(console).await } else { None };
+    let told = started.into();
+    let mut render = Render { args: &args, console, stop, coordinator: None, screen, told };
     let Some(first) = render.place_next(&mut wanted).await? else { return Ok(()) };
     match args.workers_and_threads() {
         (0, _) if args.slurm.is_none() => {
@@ -344,7 +348,7 @@ impl Render<'_> {
                 (Drawn::Here(Box::new((canvas, provenance))), tally, rendering, hosts)
             }
             Work::Job(job) => {
-                let rendering = wait(&job, self.console).await?;
+                let rendering = self.wait(&job).await?;
                 let Progress { tally, worker_count, hosts, .. } = job.progress().borrow().clone();
                 if self.args.slurm.is_some() {
                     workers = worker_count as usize;
@@ -390,21 +394,53 @@ impl Render<'_> {
         Ok(())
     }
 
+    /// Shows how far a job is until it ends.
+    async fn wait(&self, job: &Arc<Job>) -> Result<Duration, Failure> {
+        let mut progress = job.progress();
+        let bar = self.console.start_bar(progress.borrow().tile_count);
+        let preview = self.screen.as_ref().zip(self.coordinator.clone());
+        let preview = preview.map(|(screen, coordinator)| {
+            let shown = Arc::clone(job);
+            screen.begin(job.window(), move |view| coordinator.snapshot(&shown, view))
+        });
+        let rendering = loop {
+            {
+                let progress = progress.borrow_and_update();
+                bar.show(&progress);
+                match &progress.outcome {
+                    Some(Outcome::Finished(time)) => break *time,
+                    Some(Outcome::Failed(reason)) => {
+                        return Err(Failure::Other(anyhow!("{reason}")));
+                    }
+                    None => {}
+                }
+            }
+            progress.changed().await?;
+        };
+        end(bar, preview).await;
+        Ok(rendering)
+    }
+
     async fn render_here(
         &self,
         order: Order,
         (canvas, done): Begun,
-    ) -> Result<(Canvas, Tally, Duration), Failure> {
+    ) -> Result<(Arc<Canvas>, Tally, Duration), Failure> {
         let (_, threads) = self.args.workers_and_threads();
         let tile_count = order.grid.count();
         let progress = watch::Sender::new(Progress { tile_count, ..Progress::default() });
         let mut shown = progress.subscribe();
         let bar = self.console.start_bar(tile_count);
+        let (window, canvas) = (order.grid.window(), Arc::new(canvas));
+        let preview = self.screen.as_ref().map(|screen| {
+            let canvas = Arc::clone(&canvas);
+            screen.begin(window, move |view| view.pixels(canvas.picture()))
+        });
         let rendering = spawn_blocking({
-            let (isa, stop) = (self.args.isa.0, self.stop.clone());
+            let (isa, stop, canvas) = (self.args.isa.0, self.stop.clone(), Arc::clone(&canvas));
             move || {
                 let rendered =
-                    local::render(order, canvas, &done, (threads, isa), &progress, &stop);
+                    local::render(order, &canvas, &done, (threads, isa), &progress, &stop);
                 let tally = progress.borrow().tally;
                 rendered.map(|rendered| (rendered, tally))
             }
@@ -415,10 +451,9 @@ impl Render<'_> {
             }
         };
         let (rendered, ()) = tokio::join!(rendering, show);
-        drop(bar);
-        let (Some((canvas, rendering)), tally) = rendered?? else {
-            return Err(Failure::Interrupted);
-        };
+        let (rendering, tally) = rendered??;
+        let rendering = rendering.ok_or(Failure::Interrupted)?;
+        end(bar, preview).await;
         Ok((canvas, tally, rendering))
     }
 
@@ -455,7 +490,7 @@ impl Render<'_> {
             keeping: Keeping::default(),
             upload_silence: UPLOAD_SILENCE,
             events: None,
-            begins_coarsely: self.args.show,
+            begins_coarsely: self.args.show || self.screen.is_some(),
             host: None,
             orders: OrderLimits::default(),
             scene_folder: folder.path().to_owned(),
@@ -505,6 +540,14 @@ impl Render<'_> {
         stop_serving.cancel();
         serving.await??;
         end
+    }
+}
+
+/// Takes the bar away and leaves the picture as it is.
+async fn end(bar: Bar, preview: Option<Preview>) {
+    drop(bar);
+    if let Some(preview) = preview {
+        preview.end().await;
     }
 }
 
@@ -643,24 +686,6 @@ async fn begin(
         Ok((order, (canvas, Vec::new()), None))
     });
     Ok(beginning.await??)
-}
-
-/// Shows how far a job is until it ends.
-async fn wait(job: &Job, console: &Console) -> Result<Duration, Failure> {
-    let mut progress = job.progress();
-    let bar = console.start_bar(progress.borrow().tile_count);
-    loop {
-        {
-            let progress = progress.borrow_and_update();
-            bar.show(&progress);
-            match &progress.outcome {
-                Some(Outcome::Finished(time)) => return Ok(*time),
-                Some(Outcome::Failed(reason)) => return Err(Failure::Other(anyhow!("{reason}"))),
-                None => {}
-            }
-        }
-        progress.changed().await?;
-    }
 }
 
 /// Encodes a picture into its file, and writes the one beside it.

@@ -4,7 +4,7 @@ use std::{io, sync::Arc};
 
 use rtfarm_core::{
     render::{Quality, Sampling, Settings},
-    tile::{Crop, Size, TileGrid},
+    tile::{Area, Crop, Size, TileGrid},
 };
 use rtfarm_job::{Progress, Provenance};
 use rtfarm_picture::{Canvas, Notes, Picture, PictureFormat};
@@ -67,6 +67,11 @@ impl Job {
     /// Its number.
     pub fn id(&self) -> JobId {
         self.id
+    }
+
+    /// The part of the frame that it renders.
+    pub fn window(&self) -> Area {
+        self.grid.window()
     }
 
     /// Its picture, complete once the job has finished.

@@ -10,7 +10,7 @@
 //! ```text
 //! upload <- shell, service
 //! identity, tiles, pace <- lease, members, waiting, audit <- farm, store, record <- state <- job
-//! farm <- events; events, job <- shell <- live, metrics <- page; shell <- service <- run
+//! farm <- events; events, job <- shell <- live, metrics <- page; shell <- service; live, service <- run
 //! security, accept <- guard, page <- service; accept <- run
 //! ```
 

@@ -318,6 +318,37 @@ impl Told {
     }
 }
 
+/// What a view shows of a job's picture: `[y][x]`, red, green and blue. Where no tile has come yet that is
+/// a coarse picture's, if one was begun. This reads the picture: never call it on the async runtime.
+pub(crate) fn snapshot(shell: &Shell, job: &Job, view: View) -> io::Result<Vec<u8>> {
+    // First which, then what they look like.
+    let done = shell.done(job.id);
+    let mut pixels = view.pixels(job.picture())?;
+    let (Some(done), Some(coarse)) = (done, shell.coarse_of(job.id)) else { return Ok(pixels) };
+    let coarse_view = View::of(coarse.grid.window());
+    let coarse = coarse_view.pixels(coarse.picture())?;
+    let (window, coarse_size) = (job.grid.window(), coarse_view.size());
+    // The coarse pixel, along a side, that has a place of the window.
+    let scaled = |place: u32, side: u32, coarse_side: u32| {
+        (u64::from(place) * u64::from(coarse_side) / u64::from(side)) as usize
+    };
+    let places = |side: u32| (0..side).step_by(view.step() as usize);
+    for (row, y) in
+        pixels.chunks_exact_mut(3 * view.size().width() as usize).zip(places(window.height()))
+    {
+        for (pixel, x) in row.chunks_exact_mut(3).zip(places(window.width())) {
+            let tile = y / job.grid.side() * job.grid.columns() + x / job.grid.side();
+            if !done[tile as usize] {
+                let x = scaled(x, window.width(), coarse_size.width());
+                let y = scaled(y, window.height(), coarse_size.height());
+                let at = 3 * (y * coarse_size.width() as usize + x);
+                pixel.copy_from_slice(&coarse[at..at + 3]);
+            }
+        }
+    }
+    Ok(pixels)
+}
+
 /// Tiles that came: their numbers and workers, and what a view shows of them, one below the other.
 fn new_tiles(job: &Job, tiles: &[(TileId, WorkerId)]) -> io::Result<String> {
     let areas: Vec<Area> = tiles.iter().map(|&(tile, _)| job.grid.area(tile)).collect();

@@ -303,10 +303,16 @@ impl<B: Send + 'static> Service<Request<B>> for Page {
 
 #[cfg(test)]
 mod tests {
+    use rtfarm_core::{
+        render::{Quality, Tally},
+        tile::Size,
+        transfer::Transfer,
+    };
+    use rtfarm_picture::{Canvas, CanvasTile, PictureFormat, TileRecord, View};
     use rtfarm_proto::Access;
 
     use super::*;
-    use crate::{identity::Identity, shell::Config};
+    use crate::{identity::Identity, live, record::Ticket, shell::Config};
 
     /// What becomes of a request for a path, with a token or without.
     async fn ask(page: &Page, path: &str, host: &str, token: Option<&str>) -> Response<Body> {
@@ -423,6 +429,70 @@ mod tests {
             for path in ["/", "/page/events"] {
                 let response = ask(&page, path, host, None).await;
                 assert_eq!(response.status(), StatusCode::MISDIRECTED_REQUEST, "{host} {path}");
+            }
+        }
+    }
+
+    /// Nothing before the eye: a scene all the same.
+    const SCENE: &str = "viewport\norigin 0 0 -2\ntopleft -1 1 0\nbottomleft -1 -1 0\ntopright 1 1 0\n\
+        background 10 20 30\nendviewport\n";
+
+    #[tokio::test]
+    async fn a_snapshot_has_the_tiles_that_came_and_a_coarse_picture_elsewhere() {
+        let folder = tempfile::tempdir().unwrap();
+        let shell = page(folder.path(), Keeper::Nobody).shell;
+        let request = rtfarm_job::RenderRequest {
+            name: "test".to_owned(),
+            strict: false,
+            size: Some(Size::new(512, 256).unwrap()),
+            crop: None,
+            quality: Quality::default(),
+            tile_side: Some(64),
+            transfer: Transfer::None,
+            format: PictureFormat::Png8,
+        };
+        let order = request.place(SCENE.as_bytes(), &|_| unreachable!("it names no files"));
+        let order = order.order.unwrap();
+        let (grid, format, transfer) = (order.grid, order.format, order.transfer);
+        let canvas = Canvas::new_in(folder.path(), grid, format, transfer).unwrap();
+        // The third tile of the second row has come.
+        let tile = grid.tile(8 + 2).unwrap();
+        let white = vec![[1.0; 3]; 64 * 64];
+        let record = TileRecord {
+            arrived: [0; 32],
+            tally: Tally::default(),
+            seconds: 1.0,
+            elapsed: 1.0,
+            worker_count: 1,
+        };
+        let bytes = rtfarm_picture::pixel_bytes(&white);
+        canvas.put_all(&[CanvasTile { tile, bytes, record }]).unwrap();
+        let order = (order, Ticket::default());
+        let job = shell.submit_on(JobId(7), order, canvas, &[(tile, record)]).unwrap();
+        let view = View::within(grid.window(), [171, 256]);
+        assert_eq!(view.step(), 3);
+        // Of a coarse picture nothing has come yet, then all: its places are those of the whole one.
+        for [across, down] in [[0.0; 2], [1.0; 2]] {
+            if across > 0.0 {
+                let coarse = shell.coarse(&job).unwrap();
+                let window = coarse.grid.window();
+                let place = |(x, y)| [across * x as f32 / 255.0, down * y as f32 / 255.0, 0.0];
+                let pixels: Vec<[f32; 3]> = window.pixels().map(place).collect();
+                coarse.picture().put(window, &pixels).unwrap();
+            }
+            let pixels = live::snapshot(&shell, &job, view).unwrap();
+            for (at, pixel) in pixels.chunks_exact(3).enumerate() {
+                let [x, y] = [at % 171 * 3, at / 171 * 3];
+                if (128..192).contains(&x) && (64..128).contains(&y) {
+                    assert_eq!(pixel, [255; 3], "({x}, {y})");
+                } else {
+                    // A coarse pixel has two of each row and column.
+                    let near = |place: usize, found: u8, most: f32| {
+                        (most * place as f32 / 2.0 - f32::from(found)).abs() <= 1.0
+                    };
+                    let is_near = near(x, pixel[0], across) && near(y, pixel[1], down);
+                    assert!(is_near && pixel[2] == 0, "({x}, {y}): {pixel:?}");
+                }
             }
         }
     }

@@ -9,7 +9,7 @@ use std::{
 
 use rtfarm_core::tile::TileId;
 use rtfarm_job::Order;
-use rtfarm_picture::{Canvas, TileRecord};
+use rtfarm_picture::{Canvas, TileRecord, View};
 use rtfarm_proto::JobId;
 use tokio::{
     io::{AsyncRead, AsyncWrite},
@@ -26,6 +26,7 @@ use crate::{
     accept::{Door, Greeted, Limits, WAITING, accept_all},
     identity::Identity,
     job::Job,
+    live,
     record::Ticket,
     security::Security,
     service,
@@ -114,6 +115,12 @@ impl Coordinator {
     /// Sends every worker home.
     pub fn close(&self) {
         self.shell.close();
+    }
+
+    /// What a view shows of a job's picture: `[y][x]`, red, green and blue. Where no tile has come yet that
+    /// is a coarse picture's, if jobs begin so. This reads the picture: never call it on the async runtime.
+    pub fn snapshot(&self, job: &Job, view: View) -> io::Result<Vec<u8>> {
+        live::snapshot(&self.shell, job, view)
     }
 
     /// Serves the page to those on this machine who have this token, until the coordinator stops.

@@ -645,6 +645,11 @@ impl Shell {
         Some(job)
     }
 
+    /// The coarse picture of what a job renders, if it was begun.
+    pub(crate) fn coarse_of(&self, job: JobId) -> Option<Arc<Job>> {
+        self.job(coarse_id(job))
+    }
+
     fn begin(&self, job: &Arc<Job>, tiles: Tiles, earlier: Earlier, is_paused: bool) {
         tracing::info!(
             job = job.id.0,

@@ -16,4 +16,4 @@ pub use disk::{Cache, Disk};
 pub use format::PictureFormat;
 pub use picture::{Notes, Picture, PutError, TilePixels, pixel_bytes};
 pub use reading::PictureReader;
-pub use view::{View, pixel_values};
+pub use view::{View, encode_screen, pixel_values};

@@ -3,6 +3,7 @@
 use std::{
     fs::File,
     io::{self, Seek, Write},
+    ops::Range,
     os::unix::fs::FileExt,
     path::Path,
 };
@@ -185,6 +186,13 @@ impl Picture {
         for (y, row) in area.rows().zip(bytes.chunks_exact_mut(row_bytes)) {
             self.file.read_exact_at(row, self.offset_in_frame(area.x0(), y))?;
         }
+        Ok(bytes)
+    }
+
+    /// The bytes of some pixels of a row of the frame.
+    pub(crate) fn read_row(&self, y: u32, columns: Range<u32>) -> io::Result<Vec<u8>> {
+        let mut bytes = vec![0; columns.len() * self.format.bytes_per_pixel()];
+        self.file.read_exact_at(&mut bytes, self.offset_in_frame(columns.start, y))?;
         Ok(bytes)
     }
 

@@ -30,6 +30,12 @@ impl View {
         Self { window, step }
     }
 
+    /// The view of a picture of that window which shows as much as fits into so many pixels across and
+    /// down, both at least 1.
+    pub fn within(window: Area, [across, down]: [u32; 2]) -> Self {
+        Self { window, step: window.width().div_ceil(across).max(window.height().div_ceil(down)) }
+    }
+
     /// Of the picture's pixels each of so many to the right and downwards is shown.
     pub fn step(self) -> u32 {
         self.step
@@ -47,40 +53,56 @@ impl View {
     pub fn encode(self, picture: &Picture, areas: &[Area]) -> io::Result<Vec<u8>> {
         let (mut width, mut rows) = (0, Vec::new());
         for &area in areas {
-            let row_bytes = area.width() as usize * picture.format().bytes_per_pixel();
-            let bytes = picture.read_area(area)?;
-            let skipped = self.skipped(area.x0() - self.window.x0());
-            for (y, row) in area.rows().zip(bytes.chunks_exact(row_bytes)) {
-                if (y - self.window.y0()).is_multiple_of(self.step) {
-                    let pixels = row.chunks_exact(picture.format().bytes_per_pixel());
-                    let shown = pixels.skip(skipped).step_by(self.step as usize);
-                    let shown = shown.flat_map(|pixel| eight_bits(pixel, picture));
-                    rows.push(shown.collect::<Vec<u8>>());
-                    width = width.max(rows[rows.len() - 1].len());
-                }
+            for row in self.rows(picture, area) {
+                rows.push(row?);
+                width = width.max(rows[rows.len() - 1].len());
             }
         }
-        let mut png = Vec::new();
         if width == 0 {
-            return Ok(png);
+            return Ok(Vec::new());
         }
         let mut bytes = Vec::with_capacity(width * rows.len());
         for mut row in rows {
             row.resize(width, 0);
             bytes.append(&mut row);
         }
-        let mut encoder = Encoder::new(&mut png, (width / 3) as u32, (bytes.len() / width) as u32);
-        encoder.set_color(ColorType::Rgb);
-        encoder.set_depth(BitDepth::Eight);
-        encoder.set_compression(Compression::Fast);
-        encoder.write_header()?.write_image_data(&bytes)?;
-        Ok(png)
+        encode_screen(&bytes, width as u32 / 3)
+    }
+
+    /// What the view shows of the whole picture: `[y][x]`, red, green and blue. Only the rows that are
+    /// shown are read.
+    pub fn pixels(self, picture: &Picture) -> io::Result<Vec<u8>> {
+        let rows: Vec<Vec<u8>> = self.rows(picture, self.window).collect::<io::Result<_>>()?;
+        Ok(rows.concat())
+    }
+
+    /// The rows of an area that are shown, one by one.
+    fn rows(self, picture: &Picture, area: Area) -> impl Iterator<Item = io::Result<Vec<u8>>> {
+        let skipped = self.skipped(area.x0() - self.window.x0());
+        let is_shown = move |y: &u32| (y - self.window.y0()).is_multiple_of(self.step);
+        area.rows().filter(is_shown).map(move |y| {
+            let bytes = picture.read_row(y, area.columns())?;
+            let pixels = bytes.chunks_exact(picture.format().bytes_per_pixel());
+            let shown = pixels.skip(skipped).step_by(self.step as usize);
+            Ok(shown.flat_map(|pixel| eight_bits(pixel, picture)).collect())
+        })
     }
 
     /// How many pixels stand before the first that is shown, from this place on.
     fn skipped(self, place: u32) -> usize {
         (place.next_multiple_of(self.step) - place) as usize
     }
+}
+
+/// Encodes pixels of a screen, `[y][x]`, red, green and blue, as a PNG.
+pub fn encode_screen(bytes: &[u8], width: u32) -> io::Result<Vec<u8>> {
+    let mut png = Vec::new();
+    let mut encoder = Encoder::new(&mut png, width, bytes.len() as u32 / 3 / width);
+    encoder.set_color(ColorType::Rgb);
+    encoder.set_depth(BitDepth::Eight);
+    encoder.set_compression(Compression::Fast);
+    encoder.write_header()?.write_image_data(bytes)?;
+    Ok(png)
 }
 
 /// The numbers of one pixel of the window, from the upper left: light, or what a PNG says of it.
@@ -146,6 +168,29 @@ mod tests {
                     assert_eq!(pixel.0, [expected[0] as u8, expected[1] as u8, 255], "{step}");
                 }
             }
+        }
+    }
+
+    #[test]
+    fn a_view_fits_and_shows_the_whole_picture() {
+        let frame = Size::new(40, 30).unwrap();
+        let window = Area::new(frame, [3, 2], [37, 28]).unwrap();
+        let file = tempfile::tempfile().unwrap();
+        let picture = Picture::new(file, window, PictureFormat::Png8, Transfer::None).unwrap();
+        let pixels: Vec<[f32; 3]> =
+            window.pixels().map(|(x, y)| [x as f32 / 255.0, y as f32 / 255.0, 1.0]).collect();
+        picture.put(window, &pixels).unwrap();
+        for (most, step) in
+            [([37, 28], 1), ([36, 28], 2), ([37, 10], 3), ([1, 28], 37), ([8, 1], 28)]
+        {
+            let view = View::within(window, most);
+            assert_eq!(view.step(), step, "{most:?}");
+            assert!(view.size().width() <= most[0] && view.size().height() <= most[1]);
+            let at = |from: u32, count: u32| (0..count).map(move |at| (from + at * step) as u8);
+            let rows = at(2, view.size().height());
+            let expected =
+                rows.flat_map(|y| at(3, view.size().width()).flat_map(move |x| [x, y, 255]));
+            assert_eq!(view.pixels(&picture).unwrap(), expected.collect::<Vec<u8>>(), "{most:?}");
         }
     }
 

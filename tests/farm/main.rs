@@ -5,6 +5,7 @@ mod faults;
 mod frames;
 mod liar;
 mod page;
+mod preview;
 mod queue;
 mod security;
 mod slurm;
