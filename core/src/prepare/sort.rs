@@ -3,8 +3,12 @@
 use std::collections::HashMap;
 
 use glam::DVec3;
+use rayon::prelude::*;
 
-use super::{flat::FaceAttributes, surfaces::Surfaces};
+use super::{
+    flat::{FaceAttributes, FlatFaces},
+    surfaces::Surfaces,
+};
 use crate::prepared::{
     node::Node,
     record::{
@@ -54,21 +58,46 @@ impl Sorted {
     }
 }
 
+/// The corners of so many faces are gathered on all threads before these are numbered.
+const GATHERED_AT_ONCE: usize = 1 << 14;
+
+impl FlatFaces {
+    /// The points of the corners of an item, of three or four, and its attributes; `None` if it is not
+    /// flat.
+    fn gather(&self, item: usize) -> Option<([u32; 4], FaceAttributes)> {
+        (item < self.item_count()).then(|| {
+            let mut corners = [0; 4];
+            let range = self.corner_range(item);
+            corners[..range.len()].copy_from_slice(&self.corners[range]);
+            (corners, self.attributes[item])
+        })
+    }
+}
+
 impl Surfaces {
     /// Makes the records of all items, in this order of their numbers.
     pub(super) fn sort(self, order: &[u32]) -> Sorted {
         let Self { flat, solids: solids_in_file_order, .. } = self;
         let mut faces = Vec::with_capacity(order.len());
-        let mut vertices = Vec::new();
+        // The points of the vertices.
+        let mut points = Vec::with_capacity(flat.points.len());
         let mut coats = Vec::new();
         let mut coat_places = HashMap::new();
         let mut quadrangles = Vec::new();
         let mut spheres = Vec::new();
         let mut solids = Vec::new();
         let mut numbers = vec![u32::MAX; flat.points.len()];
-        for &item in order {
+        let mut gathered = Vec::new();
+        for (place, &item) in order.iter().enumerate() {
             let face = item as usize;
-            if let Some(round) = face.checked_sub(flat.item_count()) {
+            if place % GATHERED_AT_ONCE == 0 {
+                let run = &order[place..order.len().min(place + GATHERED_AT_ONCE)];
+                run.par_iter()
+                    .map(|&item| flat.gather(item as usize))
+                    .collect_into_vec(&mut gathered);
+            }
+            let Some((mut corners, attributes)) = gathered[place % GATHERED_AT_ONCE] else {
+                let round = face - flat.item_count();
                 if let Some(&sphere) = self.spheres.get(round) {
                     faces.push(FaceRecord::of(Kind::Sphere, spheres.len()));
                     spheres.push(sphere);
@@ -77,18 +106,18 @@ impl Surfaces {
                     solids.push(solids_in_file_order[round - self.spheres.len()]);
                 }
                 continue;
-            }
-            let mut corners = [0; 4];
-            for (slot, &point) in corners.iter_mut().zip(&flat.corners[flat.corner_range(face)]) {
-                let number = &mut numbers[point as usize];
+            };
+            let is_quadrangle = face >= flat.triangle_count;
+            for corner in &mut corners[..3 + usize::from(is_quadrangle)] {
+                let number = &mut numbers[*corner as usize];
                 if *number == u32::MAX {
-                    *number = vertices.len() as u32;
-                    vertices.push(flat.points[point as usize].to_array());
+                    *number = points.len() as u32;
+                    points.push(*corner);
                 }
-                *slot = *number;
+                *corner = *number;
             }
+            let FaceAttributes { material, rank } = attributes;
             let [a, b, c, _] = corners;
-            let FaceAttributes { material, rank } = flat.attributes[face];
             if let Some(quadrangle) = face.checked_sub(flat.triangle_count) {
                 let plane = self.quadrangle_planes[quadrangle];
                 faces.push(FaceRecord::of(Kind::Quadrangle, quadrangles.len()));
@@ -104,6 +133,8 @@ impl Surfaces {
                 faces.push(FaceRecord::triangle([a, b, c], material, rank));
             }
         }
+        let vertices =
+            points.par_iter().map(|&point| flat.points[point as usize].to_array()).collect();
         Sorted {
             faces,
             vertices,
