@@ -119,31 +119,82 @@ impl Branch {
 /// Russian roulette among a sample's branches of one depth that are lighter than [`FULL_WEIGHT`]:
 /// in a row, each as long as its weight, they are combed with a tooth every [`FULL_WEIGHT`] from a
 /// random start on, and those that a tooth meets survive. So each survives with the probability
-/// weight / `FULL_WEIGHT`, and all together keep their weight within one tooth.
+/// weight / `FULL_WEIGHT`, and all together keep their weight within one tooth. They stand in the order of
+/// their [`Way`], so that those of the same way do so too.
 ///
 /// Sources: a range of weights that paths are brought into by roulette, Vorba & Křivánek,
 /// "Adjoint-driven Russian roulette and splitting in light transport simulation" (2016); the comb,
-/// Booth, "A Weight (Charge) Conserving Importance-Weighted Comb for Monte Carlo" (1996).
+/// Booth, "A Weight (Charge) Conserving Importance-Weighted Comb for Monte Carlo" (1996); paths
+/// sorted by where they are, L'Ecuyer, Lécot & Tuffin, "A Randomized Quasi-Monte Carlo Simulation Method for
+/// Markov Chains" (2008).
 #[derive(Debug, Default)]
 struct Roulette {
-    sample: Option<usize>,
-    /// How far the row has come since the last tooth, in units of [`FULL_WEIGHT`]: 0..1.
-    sum: f64,
+    /// The light branches of one sample at one depth.
+    light: RayQueue,
+    /// How each of them leaves what, and its place among them.
+    ways: Vec<Way>,
 }
 
 impl Roulette {
-    /// Whether the next light branch survives.
-    fn survives(&mut self, branch: &Branch, samples: &[Sample]) -> bool {
-        if self.sample != Some(branch.sample) {
-            let sum = samples[branch.sample].roulette(branch.depth);
-            *self = Self { sample: Some(branch.sample), sum };
+    /// Takes in a light branch.
+    fn add(&mut self, way: Way, ray: Ray, branch: Branch, differential: Option<RayDifferential>) {
+        self.ways.push(way.at(self.ways.len()));
+        self.light.push(ray, branch, differential);
+    }
+
+    /// Whether it has branches of another sample.
+    #[inline(always)]
+    fn has_other(&self, sample: usize) -> bool {
+        self.light.branches.first().is_some_and(|branch| branch.sample != sample)
+    }
+
+    /// Queues the branches that survive, and has none then.
+    fn decide(&mut self, samples: &[Sample], queue: &mut RayQueue) {
+        let Some(first) = self.light.branches.first() else { return };
+        // How far the row has come since the last tooth, in units of `FULL_WEIGHT`: 0..1.
+        let mut sum = samples[first.sample].roulette(first.depth);
+        self.ways.sort_unstable();
+        for way in self.ways.drain(..) {
+            let place = way.place();
+            let branch = self.light.branches[place];
+            sum += branch.weight * (1.0 / FULL_WEIGHT);
+            if sum >= 1.0 {
+                sum -= 1.0;
+                let differential = self.light.differentials.get(place).copied();
+                let branch = Branch { weight: FULL_WEIGHT, ..branch };
+                queue.push(self.light.rays[place], branch, differential);
+            }
         }
-        self.sum += branch.weight * (1.0 / FULL_WEIGHT);
-        let survives = self.sum >= 1.0;
-        if survives {
-            self.sum -= 1.0;
-        }
-        survives
+        self.light.clear();
+    }
+}
+
+/// How a branch leaves a face, in its high bits; the low ones are for a place in a row. Branches that
+/// leave the same face in the same way see much the same, and those of neighbours in this order similar
+/// things: first come those that leave backs, from the last face of the file to the first, then those that
+/// leave fronts, from the first to the last.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+struct Way(u64);
+
+impl Way {
+    /// A sample has far fewer branches at one depth.
+    const PLACES: u64 = 1 << 30;
+
+    #[inline(always)]
+    fn new(at: &Interaction<'_>, is_transmitted: bool) -> Self {
+        let is_before = at.is_front != is_transmitted;
+        let rank = if is_before { at.rank } else { !at.rank };
+        let number = u64::from(is_before) << 33 | u64::from(rank) << 1 | u64::from(is_transmitted);
+        Self(number * Self::PLACES)
+    }
+
+    /// With a place in a row.
+    fn at(self, place: usize) -> Self {
+        Self(self.0 | place as u64)
+    }
+
+    fn place(self) -> usize {
+        (self.0 % Self::PLACES) as usize
     }
 }
 
@@ -292,7 +343,6 @@ impl Wavefront {
         let has_textures = view.header.features.has_textures();
         self.points.clear();
         self.next_queue.clear();
-        self.roulette = Roulette::default();
         let mut last = None;
         for index in 0..self.queue.rays.len() {
             if !self.hits[index].is_some() {
@@ -304,6 +354,7 @@ impl Wavefront {
                 self.meet::<false>(view, index, &mut last);
             }
         }
+        self.roulette.decide(&self.samples, &mut self.next_queue);
     }
 
     /// Ray `index` has met a face: finds the surface, shades it, and branches. `last` is the last
@@ -362,6 +413,9 @@ impl Wavefront {
         at: &Interaction<'_>,
         differential: Option<RayDifferential>,
     ) {
+        if self.roulette.has_other(branch.sample) {
+            self.roulette.decide(&self.samples, &mut self.next_queue);
+        }
         let (reflect, alpha, index) = (at.material.reflect, at.material.alpha, at.material.refract);
         let cosine = -at.normal.dot(ray.direction);
         let curvature = if differential.is_some() { at.curvature(view) } else { 0.0 };
@@ -392,27 +446,33 @@ impl Wavefront {
             let mirrored = at.leave(mirror(ray.direction, at.normal, cosine), Ray::NOTHING_AHEAD);
             let differential =
                 differential.map(|it| it.mirror(ray.direction, at.normal, curvature));
-            self.follow(mirrored, branch.next(mirrored_share, 1), differential);
+            let way = Way::new(at, false);
+            self.follow(way, mirrored, branch.next(mirrored_share, 1), differential);
         }
         if let Some((ray, branch, differential)) = transmitted {
-            self.follow(ray, branch, differential);
+            self.follow(Way::new(at, true), ray, branch, differential);
         }
     }
 
-    /// Queues a ray, unless its branch lies too deep, or counts little and does not survive.
+    /// Queues a ray, or has roulette decide about it where its branch counts little, unless that lies
+    /// too deep.
     #[inline(always)]
-    fn follow(&mut self, ray: Ray, mut branch: Branch, differential: Option<RayDifferential>) {
+    fn follow(
+        &mut self,
+        way: Way,
+        ray: Ray,
+        branch: Branch,
+        differential: Option<RayDifferential>,
+    ) {
         if branch.depth > DEEPEST || self.cutoff.is_some_and(|cutoff| branch.weight < cutoff) {
             self.untraced[branch.sample] += branch.weight;
             return;
         }
         if branch.weight < FULL_WEIGHT && self.cutoff.is_none() {
-            if !self.roulette.survives(&branch, &self.samples) {
-                return;
-            }
-            branch.weight = FULL_WEIGHT;
+            self.roulette.add(way, ray, branch, differential);
+        } else {
+            self.next_queue.push(ray, branch, differential);
         }
-        self.next_queue.push(ray, branch, differential);
     }
 
     /// Finds the light that the points receive; how many rays that took.

@@ -95,8 +95,9 @@ impl<'a> Judge<'a> {
             let seen = self.seen(sight, first);
             if let (Some(seen), false) = (&seen, is_filled) {
                 let faces = (outlines, &suspects[..]);
-                let gap = self.find_gap(sight, faces, &pixel, (first, seen), around);
-                gap.into_iter().for_each(|gap| unseen.add_gap(gap));
+                if let Some(gap) = self.find_gap(sight, faces, &pixel, (first, seen), around) {
+                    unseen.add_gap(gap);
+                }
             }
             for &index in &suspects {
                 let outline = &outlines.as_slice()[index];

@@ -289,12 +289,13 @@ impl Clipper {
 /// Whether a polygon surely fills a rectangle: its edges, lengthened, pass by it and it holds the middle.
 pub(super) fn fills(polygon: &[Corner], rectangle: &Rectangle) -> bool {
     let Rectangle { low: [x0, y0], high: [x1, y1] } = *rectangle;
-    let middle = [(x0 + x1) / 2.0, (y0 + y1) / 2.0];
+    let middle = [x0.midpoint(x1), y0.midpoint(y1)];
     let Some(mut a) = polygon.last() else { return false };
     for b in polygon {
         let (dx, dy) = (b[0] - a[0], b[1] - a[1]);
         let height = dx * (middle[1] - a[1]) - dy * (middle[0] - a[0]);
-        if height.abs() < (dx.abs() * (y1 - y0) + dy.abs() * (x1 - x0)) / 2.0 {
+        let reach = dx.abs() * (y1 - y0) + dy.abs() * (x1 - x0);
+        if 2.0 * height.abs() < reach {
             return false;
         }
         a = b;
