@@ -11,7 +11,7 @@ use clap::{
     Args as ClapArgs, Parser, Subcommand, ValueEnum, builder::NonEmptyStringValueParser,
     value_parser,
 };
-use rtfarm_coordinator::{Limits, OrderLimits, Role};
+use rtfarm_coordinator::{Limits, OrderLimits, Owner, Role};
 use rtfarm_core::{
     isa::{Isa, IsaError},
     prepare::Form,
@@ -246,6 +246,13 @@ pub(crate) struct TokensArgs {
     /// The role whose token it is: submit, work, read or admin.
     #[arg(value_name = "ROLE")]
     pub(crate) role: Role,
+
+    /// A token to submit of this owner's own, in DIR/access/submit.NAME.
+    ///
+    /// Jobs that are ordered by it are the owner's, and have a budget of their own: see `coordinator
+    /// --most-jobs`. Renewing makes it when there is none.
+    #[arg(long, value_name = "NAME")]
+    pub(crate) owner: Option<Owner>,
 
     /// The folder of the farm's state.
     #[arg(long, value_name = "DIR", env = "RTFARM_STATE")]
@@ -520,7 +527,8 @@ pub(crate) struct CoordinatorArgs {
     #[arg(long, value_name = "MB", default_value = "1000", value_parser = value_parser!(u32).range(16..), env = "RTFARM_FLIGHT_MB", help_heading = LIMITS)]
     flight_mb: u32,
 
-    /// The most jobs that have not ended; who has the token `admin` may order more, also of the next two.
+    /// The most jobs that have not ended, of each owner of a token and of all others together; who has the
+    /// token `admin` may order more, also of the next two.
     #[arg(long, value_name = "N", default_value = "1000", env = "RTFARM_MOST_JOBS", help_heading = LIMITS)]
     most_jobs: u64,
 
@@ -528,7 +536,7 @@ pub(crate) struct CoordinatorArgs {
     #[arg(long, value_name = "MILLIONS", default_value = "16384", value_parser = parse_millions, env = "RTFARM_MOST_MEGAPIXELS", help_heading = LIMITS)]
     most_megapixels: u64,
 
-    /// The most bytes, in GB, that all jobs have on disk.
+    /// The most bytes, in GB, that all their jobs have on disk.
     #[arg(long, value_name = "GB", default_value = "256", value_parser = parse_gigabytes, env = "RTFARM_MOST_GB", help_heading = LIMITS)]
     most_gb: u64,
 
@@ -611,7 +619,7 @@ pub(crate) struct SubmitArgs {
     #[arg(long, value_name = "NAME", help_heading = FARM)]
     pub(crate) name: Option<String>,
 
-    /// Who wants it; the user's login name by default.
+    /// Who wants it; the user's login name by default, and whoever has a token of their own.
     #[arg(long, value_name = "OWNER", env = "RTFARM_OWNER", help_heading = FARM)]
     pub(crate) owner: Option<String>,
 

@@ -11,7 +11,7 @@ use std::{
 
 use anyhow::{Context, anyhow};
 use rtfarm_coordinator::{
-    Config, Coordinator, Durability, Keeping, Listener, Security, StateError, StateFolder,
+    Config, Coordinator, Durability, Holder, Keeping, Listener, Security, StateError, StateFolder,
     renew_token, revoke_token,
 };
 use rtfarm_core::isa::Isa;
@@ -172,15 +172,20 @@ pub(crate) fn make_certificates(args: &CertsArgs) -> Result<(), Failure> {
 
 /// `rtfarm tokens`.
 pub(crate) fn change_tokens(args: &TokensArgs) -> Result<(), Failure> {
-    let TokensArgs { change, role, state } = args;
+    let TokensArgs { change, role, owner, state } = args;
+    let holder =
+        Holder::new(*role, owner.clone()).map_err(|reason| Failure::Input(anyhow!(reason)))?;
     let told = match change {
         TokenChange::Renew => {
-            let path = renew_token(state, *role).map_err(anyhow::Error::from)?;
+            let path = renew_token(state, &holder).map_err(anyhow::Error::from)?;
             path.display().to_string()
         }
         TokenChange::Revoke => {
-            revoke_token(state, *role).map_err(anyhow::Error::from)?;
-            format!("nobody has a token to {role} any more")
+            revoke_token(state, &holder).map_err(anyhow::Error::from)?;
+            match owner {
+                Some(owner) => format!("{owner} has no token to {role} any more"),
+                None => format!("nobody has the token to {role} any more"),
+            }
         }
     };
     writeln!(io::stdout().lock(), "{told}").context("cannot write to standard output")?;

@@ -72,14 +72,14 @@ where
         if let Some(security) = &self.security {
             let path = request.uri().path();
             let shown = request.headers().get(AUTHORIZATION).map(HeaderValue::as_bytes);
-            let role = match security.check(path, shown) {
-                Ok(role) => role,
+            let holder = match security.check(path, shown) {
+                Ok(holder) => holder,
                 Err(status) => {
                     tracing::warn!(path, reason = status.message(), "refused a call");
                     return Box::pin(ready(Ok(status.into_http())));
                 }
             };
-            request.extensions_mut().insert(role);
+            request.extensions_mut().insert(holder);
             if let Some(peer) = request.extensions().get::<Peer>() {
                 peer.admit();
             }

@@ -53,7 +53,7 @@ pub use accept::{Limits, listen};
 pub use farm::Keeping;
 pub use job::Job;
 pub use run::{Coordinator, Listener, ServeError};
-pub use security::{Role, Security, SecurityError, renew_token, revoke_token};
+pub use security::{Holder, Owner, Role, Security, SecurityError, renew_token, revoke_token};
 pub use shell::{Config, SubmitError};
 pub use state::{Durability, StateError, StateFolder};
 pub use upload::OrderLimits;

@@ -80,6 +80,9 @@ pub(crate) struct JobRecord {
     /// The most workers that render it at the same time; 0: any number.
     #[prost(uint32, tag = "11")]
     pub(crate) most_workers: u32,
+    /// Whose budget it is in; empty: that of all who have no token of their own.
+    #[prost(string, tag = "12")]
+    pub(crate) account: String,
 }
 
 /// What a client says of a job besides what it renders.
@@ -89,6 +92,8 @@ pub(crate) struct Ticket {
     pub(crate) name: String,
     /// Who wants it.
     pub(crate) owner: String,
+    /// Whose budget it is in: the owner of the token that it was ordered by; empty if that has none.
+    pub(crate) account: String,
     /// Another order with the same key is for the same job; empty if none is.
     pub(crate) key: String,
     pub(crate) priority: i32,
@@ -181,10 +186,11 @@ impl JobRecord {
             tile_side: grid.side(),
             window: Some(Crop::from(grid.window()).into()),
         };
-        let Ticket { name, owner, key, priority, most_workers } = ticket.clone();
+        let Ticket { name, owner, account, key, priority, most_workers } = ticket.clone();
         Self {
             name,
             owner,
+            account,
             key,
             priority,
             is_paused: false,
@@ -198,9 +204,9 @@ impl JobRecord {
     }
 
     pub(crate) fn ticket(&self) -> Ticket {
-        let Self { name, owner, key, priority, most_workers, .. } = self.clone();
+        let Self { name, owner, account, key, priority, most_workers, .. } = self.clone();
         let most_workers = (most_workers > 0).then_some(most_workers);
-        Ticket { name, owner, key, priority, most_workers }
+        Ticket { name, owner, account, key, priority, most_workers }
     }
 
     pub(crate) fn plan(&self) -> Result<Plan, RecordError> {

@@ -4,8 +4,9 @@
 //! ```text
 //! access/authority      the farm's own authority: its certificate and key, as PEM
 //! access/certificate    what the coordinator shows: likewise, vouched for by the authority
-//! access/tokens         the address, then a line a role: its name and its token's BLAKE3 hash
+//! access/tokens         the address, then a line a token: its holder's name and its BLAKE3 hash
 //! access/submit, work, read, admin     access files, to be handed to those who need them
+//! access/submit.NAME    likewise, of one whose orders are counted by themselves
 //! ```
 //!
 //! Tokens are 32 random bytes: a plain hash of one tells nothing.
@@ -114,6 +115,83 @@ impl FromStr for Role {
     }
 }
 
+/// The name of one whose orders are counted by themselves: 1 to 32 letters, digits, `-` and `_`.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Owner(String);
+
+impl FromStr for Owner {
+    type Err = String;
+
+    fn from_str(name: &str) -> Result<Self, String> {
+        let is_plain = |byte: u8| byte.is_ascii_alphanumeric() || b"-_".contains(&byte);
+        if (1..=32).contains(&name.len()) && name.bytes().all(is_plain) {
+            Ok(Self(name.to_owned()))
+        } else {
+            Err(format!("`{name}` is no owner's name: 1 to 32 letters, digits, `-` and `_`"))
+        }
+    }
+}
+
+impl fmt::Display for Owner {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(&self.0)
+    }
+}
+
+/// Whose a token is. Only one to submit may have an owner. Its text is that of its file's name:
+/// `work`, or `submit.NAME`.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Holder {
+    role: Role,
+    owner: Option<Owner>,
+}
+
+impl Holder {
+    /// Who has a role, as this owner if one is named.
+    pub fn new(role: Role, owner: Option<Owner>) -> Result<Self, String> {
+        if owner.is_some() && role != Role::Submit {
+            return Err(format!("owners have tokens to submit, not to {role}"));
+        }
+        Ok(Self { role, owner })
+    }
+
+    /// What its token allows.
+    pub(crate) fn role(&self) -> Role {
+        self.role
+    }
+
+    /// Who orders by it; `None` when the token is one for all.
+    pub(crate) fn owner(&self) -> Option<&Owner> {
+        self.owner.as_ref()
+    }
+}
+
+impl From<Role> for Holder {
+    fn from(role: Role) -> Self {
+        Self { role, owner: None }
+    }
+}
+
+impl fmt::Display for Holder {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match &self.owner {
+            Some(owner) => write!(f, "{}.{owner}", self.role),
+            None => self.role.fmt(f),
+        }
+    }
+}
+
+impl FromStr for Holder {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        match text.split_once('.') {
+            Some((role, owner)) => Self::new(role.parse()?, Some(owner.parse()?)),
+            None => text.parse::<Role>().map(Self::from),
+        }
+    }
+}
+
 /// Why a farm's certificate or tokens cannot be used.
 #[derive(Debug, thiserror::Error)]
 pub enum SecurityError {
@@ -147,11 +225,11 @@ struct Known {
     read_at: Instant,
 }
 
-/// The address in the access files, and a token's hash for each role that has one.
+/// The address in the access files, and the hash of each token.
 #[derive(Debug, Clone, Default, PartialEq)]
 struct Tokens {
     address: String,
-    hashes: Vec<(Role, Hash)>,
+    hashes: Vec<(Holder, Hash)>,
 }
 
 impl Security {
@@ -176,15 +254,18 @@ impl Security {
             tokens.address = address_text;
             tokens.write(&folder)?;
         }
-        for role in Role::ALL {
+        let holders = Role::ALL.map(Holder::from).into_iter();
+        let owners = tokens.hashes.into_iter().map(|(holder, _)| holder);
+        for holder in holders.chain(owners.filter(|holder| holder.owner.is_some())) {
+            let path = folder.join(holder.to_string());
             if is_new {
-                renew_in(&folder, role)?;
-            } else if let Ok(text) = fs::read_to_string(folder.join(role.name()))
+                renew_in(&folder, &holder)?;
+            } else if let Ok(text) = fs::read_to_string(&path)
                 && let Ok(access) = Access::read(&text)
                 && access.address() != address
                 && let Some(moved) = access.at(address.clone()).text()
             {
-                write(&folder.join(role.name()), &moved)?;
+                write(&path, &moved)?;
             }
         }
         let known = Known { tokens: Tokens::read(&folder)?, stamp: None, read_at: Instant::now() };
@@ -206,7 +287,7 @@ impl Security {
 
     /// Says as whom who shows this `Authorization` may call that method. A file of tokens that was
     /// written to is read anew.
-    pub(crate) fn check(&self, path: &str, authorization: Option<&[u8]>) -> Result<Role, Status> {
+    pub(crate) fn check(&self, path: &str, authorization: Option<&[u8]>) -> Result<Holder, Status> {
         let token = authorization.and_then(|value| value.strip_prefix(b"Bearer "));
         let Some(token) = token else {
             return Err(Status::unauthenticated(
@@ -216,11 +297,11 @@ impl Security {
         // Hashes of this kind are compared in constant time.
         let hash = blake3::hash(token);
         let known = self.known();
-        let mut roles =
-            known.hashes.iter().filter(|(_, known)| *known == hash).map(|&(role, _)| role);
-        match (roles.clone().find(|role| role.may(path)), roles.next()) {
-            (Some(role), _) => Ok(role),
-            (None, Some(role)) => Err(Status::new(
+        let mut holders =
+            known.hashes.iter().filter(|(_, known)| *known == hash).map(|(holder, _)| holder);
+        match (holders.clone().find(|holder| holder.role.may(path)), holders.next()) {
+            (Some(holder), _) => Ok(holder.clone()),
+            (None, Some(Holder { role, .. })) => Err(Status::new(
                 Code::PermissionDenied,
                 format!("the token is one to {role}, which does not allow this"),
             )),
@@ -248,19 +329,18 @@ impl Security {
     }
 }
 
-/// Makes a new token and access file for a role; the old one is not taken any more. Answers with the
-/// file.
-pub fn renew_token(state: &Path, role: Role) -> Result<PathBuf, SecurityError> {
-    renew_in(&of_state(state)?, role)
+/// Makes a new token and access file; the holder's old one is not taken any more. Answers with the file.
+pub fn renew_token(state: &Path, holder: &Holder) -> Result<PathBuf, SecurityError> {
+    renew_in(&of_state(state)?, holder)
 }
 
-/// Has a role's token not taken any more, and removes its access file.
-pub fn revoke_token(state: &Path, role: Role) -> Result<(), SecurityError> {
+/// Has a token not taken any more, and removes its access file.
+pub fn revoke_token(state: &Path, holder: &Holder) -> Result<(), SecurityError> {
     let folder = of_state(state)?;
     let mut tokens = Tokens::read(&folder)?;
-    tokens.hashes.retain(|&(of, _)| of != role);
+    tokens.hashes.retain(|(of, _)| of != holder);
     tokens.write(&folder)?;
-    let path = folder.join(role.name());
+    let path = folder.join(holder.to_string());
     match fs::remove_file(&path) {
         Err(error) if error.kind() != io::ErrorKind::NotFound => {
             Err(SecurityError::Io(path, error))
@@ -274,8 +354,8 @@ fn of_state(state: &Path) -> Result<PathBuf, SecurityError> {
     if folder.join(TOKENS).exists() { Ok(folder) } else { Err(SecurityError::None(folder)) }
 }
 
-fn renew_in(folder: &Path, role: Role) -> Result<PathBuf, SecurityError> {
-    let (path, authority) = (folder.join(role.name()), folder.join(AUTHORITY));
+fn renew_in(folder: &Path, holder: &Holder) -> Result<PathBuf, SecurityError> {
+    let (path, authority) = (folder.join(holder.to_string()), folder.join(AUTHORITY));
     let io = |error| SecurityError::Io(path.clone(), error);
     let mut tokens = Tokens::read(folder)?;
     let mut random = [0; 32];
@@ -292,8 +372,8 @@ fn renew_in(folder: &Path, role: Role) -> Result<PathBuf, SecurityError> {
     let access = Access::new(address, certificate.to_owned(), token.clone());
     // The file first: nobody has a token that is known and written nowhere.
     write(&path, &access.text().expect("it has a token"))?;
-    tokens.hashes.retain(|&(of, _)| of != role);
-    tokens.hashes.push((role, blake3::hash(token.as_bytes())));
+    tokens.hashes.retain(|(of, _)| of != holder);
+    tokens.hashes.push((holder.clone(), blake3::hash(token.as_bytes())));
     tokens.write(folder)?;
     Ok(path)
 }
@@ -310,9 +390,9 @@ impl Tokens {
             if name == "address" {
                 value.clone_into(&mut tokens.address);
             } else {
-                let role = name.parse().map_err(|_| damaged())?;
+                let holder = name.parse().map_err(|_| damaged())?;
                 let hash = Hash::from_hex(value).map_err(|_| damaged())?;
-                tokens.hashes.push((role, hash));
+                tokens.hashes.push((holder, hash));
             }
         }
         Ok(tokens)
@@ -320,9 +400,9 @@ impl Tokens {
 
     fn write(&self, folder: &Path) -> Result<(), SecurityError> {
         let mut text = format!("address {}\n", self.address);
-        for (role, hash) in &self.hashes {
-            let hex = hash.to_hex();
-            text.extend([role.name(), " ", hex.as_str(), "\n"]);
+        for (holder, hash) in &self.hashes {
+            text +=
+                &[holder.to_string(), " ".to_owned(), hash.to_string(), "\n".to_owned()].concat();
         }
         write(&folder.join(TOKENS), &text)
     }
@@ -374,8 +454,9 @@ mod tests {
         "https://127.0.0.1:7878".parse().unwrap()
     }
 
-    fn access(state: &Path, role: Role) -> Access {
-        let text = fs::read_to_string(state.join(FOLDER).join(role.name())).unwrap();
+    fn access(state: &Path, holder: impl Into<Holder>) -> Access {
+        let name = holder.into().to_string();
+        let text = fs::read_to_string(state.join(FOLDER).join(name)).unwrap();
         Access::read(&text).unwrap()
     }
 
@@ -416,12 +497,12 @@ mod tests {
         let kept = fs::read_to_string(state.path().join("access/tokens")).unwrap();
         assert!(!kept.contains(&token));
 
-        renew_token(state.path(), Role::Submit).unwrap();
+        renew_token(state.path(), &Role::Submit.into()).unwrap();
         let renewed = access(state.path(), Role::Submit).token().unwrap().to_owned();
         tokio::time::advance(REREAD).await;
         assert_eq!(check(&security, submit, &token), Some(Code::Unauthenticated));
         assert_eq!(check(&security, submit, &renewed), None);
-        revoke_token(state.path(), Role::Submit).unwrap();
+        revoke_token(state.path(), &Role::Submit.into()).unwrap();
         tokio::time::advance(REREAD).await;
         assert_eq!(check(&security, submit, &renewed), Some(Code::Unauthenticated));
 
@@ -432,6 +513,43 @@ mod tests {
         assert_eq!(worker.address(), &elsewhere);
         assert_eq!(check(&again, "/rtfarm.v1.Farm/Join", worker.token().unwrap()), None);
         assert!(!state.path().join("access/submit").exists());
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn owners_have_tokens_of_their_own_to_submit() {
+        let state = tempfile::tempdir().unwrap();
+        let security = Security::open(state.path(), &address()).unwrap();
+        let holder = |name: &str| -> Holder { name.parse().unwrap() };
+        let [ada, bo] = ["submit.ada", "submit.bo_2"].map(holder);
+        for holder in [&ada, &bo] {
+            renew_token(state.path(), holder).unwrap();
+        }
+        tokio::time::advance(REREAD).await;
+        let found = |security: &Security, holder: &Holder| {
+            let shown = format!("Bearer {}", access(state.path(), holder.clone()).token().unwrap());
+            security.check("/rtfarm.v1.Jobs/Submit", Some(shown.as_bytes())).ok()
+        };
+        let all = Holder::from(Role::Submit);
+        for holder in [&ada, &bo, &all] {
+            assert_eq!(found(&security, holder).as_ref(), Some(holder));
+        }
+        let old = access(state.path(), ada.clone());
+        let of_bo = access(state.path(), bo.clone());
+        revoke_token(state.path(), &ada).unwrap();
+        tokio::time::advance(REREAD).await;
+        let code = check(&security, "/rtfarm.v1.Jobs/Submit", old.token().unwrap());
+        assert_eq!(code, Some(Code::Unauthenticated));
+        assert_eq!(found(&security, &bo).as_ref(), Some(&bo), "the others are as they were");
+        // They learn of another address at the next start, too.
+        let elsewhere: Address = "https://elsewhere:1".parse().unwrap();
+        let again = Security::open(state.path(), &elsewhere).unwrap();
+        let moved = access(state.path(), bo.clone());
+        assert_eq!((moved.address(), moved.token()), (&elsewhere, of_bo.token()));
+        assert_eq!(found(&again, &bo), Some(bo));
+        for wrong in ["work.ada", "submit.", "submit.a.b", "submit.a/b", "submit.a b", "submit.é"]
+        {
+            wrong.parse::<Holder>().unwrap_err();
+        }
     }
 
     #[test]

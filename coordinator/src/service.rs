@@ -45,7 +45,7 @@ use crate::{
     members::{MemberEntry, NoMember, Process, Standing},
     page::{Keeper, Page},
     record::{Ticket, to_event, to_standing},
-    security::{Role, Security},
+    security::{Holder, Owner, Role, Security},
     shell::{ChangeError, Config, Shell},
     tiles::PixelHash,
     upload::{Ordered, Spool, Uploads},
@@ -289,13 +289,14 @@ impl jobs_server::Jobs for JobsService {
         &self,
         request: Request<Streaming<wire::SubmitRequest>>,
     ) -> Result<Response<wire::SubmitResponse>, Status> {
-        let is_admin = request.extensions().get::<Role>() == Some(&Role::Admin);
+        let holder = request.extensions().get::<Holder>().cloned();
+        let is_admin = holder.as_ref().is_some_and(|holder| holder.role() == Role::Admin);
         let bundle = match receive(request.into_inner(), &self.shell, &self.uploads).await? {
             Received::Known(job) => return Ok(Response::new(accepted(&job, &self.shell))),
             Received::New(bundle) => bundle,
         };
         let Bundle { order, spool } = *bundle;
-        let ticket = to_ticket(&order);
+        let ticket = to_ticket(&order, holder.as_ref().and_then(Holder::owner));
         let wanted = to_request(order).map_err(invalid)?;
         let shell = Arc::clone(&self.shell);
         let client_gone = CancellationToken::new();
@@ -315,7 +316,9 @@ impl jobs_server::Jobs for JobsService {
                 // Two that come together do not both take the last place.
                 let _one = shell.ordering.lock().expect("nothing there panics");
                 let limits = shell.config.orders;
-                let refusal = || limits.refusal(ordered(&shell), to_be_ordered(&order));
+                let account = &ticket.account;
+                let there = || ordered(&shell, account);
+                let refusal = || limits.refusal(account, there(), to_be_ordered(&order));
                 match refusal().filter(|_| !is_admin) {
                     Some(reason) => Err(Refusal::Other(reason)),
                     None => shell
@@ -637,10 +640,11 @@ struct Bundle {
     spool: Spool,
 }
 
-/// What the farm has to do and to keep.
-fn ordered(shell: &Shell) -> Ordered {
+/// What the farm has to do and to keep for an account.
+fn ordered(shell: &Shell, account: &str) -> Ordered {
     let mut all = Ordered::default();
-    for (JobEntry { phase, terms, .. }, job) in shell.jobs() {
+    let jobs = shell.jobs().into_iter().filter(|(_, job)| job.ticket.account == account);
+    for (JobEntry { phase, terms, .. }, job) in jobs {
         all.bytes += terms.byte_count;
         if !matches!(phase, JobPhase::Finished | JobPhase::Failed) {
             all.jobs += 1;
@@ -738,11 +742,14 @@ impl Upload {
     }
 }
 
-fn to_ticket(order: &wire::Order) -> Ticket {
+/// What an order says, of which whoever has a token as an owner is the owner.
+fn to_ticket(order: &wire::Order, holder: Option<&Owner>) -> Ticket {
     let wire::Order { name, title, owner, key, priority, max_workers, .. } = order.clone();
     let name = if title.is_empty() { name } else { title };
     let most_workers = (max_workers > 0).then_some(max_workers);
-    Ticket { name, owner, key, priority, most_workers }
+    let account = holder.map(Owner::to_string).unwrap_or_default();
+    let owner = if account.is_empty() { owner } else { account.clone() };
+    Ticket { name, owner, account, key, priority, most_workers }
 }
 
 fn to_request(order: wire::Order) -> Result<RenderRequest, WireError> {

@@ -13,7 +13,7 @@ use std::{
     },
 };
 
-/// What is ordered may be so much. Who looks after the farm, with a token to do everything, may order
+/// What is ordered may be so much: by each owner of a token, and by all others together. Who looks after the farm, with a token to do everything, may order
 /// more.
 #[derive(Debug, Clone, Copy)]
 pub struct OrderLimits {
@@ -51,7 +51,7 @@ pub(crate) struct Ordered {
 
 impl OrderLimits {
     /// Says why an order cannot be taken on top of what there is; `None` when it can.
-    pub(crate) fn refusal(&self, there: Ordered, order: Ordered) -> Option<String> {
+    pub(crate) fn refusal(&self, account: &str, there: Ordered, order: Ordered) -> Option<String> {
         let [jobs, pixels, bytes] = [
             (there.jobs, order.jobs, self.jobs),
             (there.pixels, order.pixels, self.pixels),
@@ -72,7 +72,8 @@ impl OrderLimits {
         } else {
             return None;
         };
-        Some(format!("the farm takes no more for now: {over}; cancel or fetch jobs, or wait"))
+        let of = if account.is_empty() { String::new() } else { format!(" of {account}") };
+        Some(format!("the farm takes no more{of} for now: {over}; cancel or fetch jobs, or wait"))
     }
 }
 
@@ -190,7 +191,7 @@ mod tests {
         let limits = OrderLimits { bytes: 1_000_000_000, ..limits };
         let there = Ordered { jobs: 1, pixels: 60, bytes: 500_000_000 };
         let order = Ordered { jobs: 1, pixels: 40, bytes: 500_000_000 };
-        assert_eq!(limits.refusal(there, order), None);
+        assert_eq!(limits.refusal("", there, order), None);
         for (order, reason) in [
             (Ordered { jobs: 2, ..order }, "there are 1 jobs already, and may be 2"),
             (
@@ -202,8 +203,10 @@ mod tests {
                 "GB more on disk than 0.50 GB would be more than 1.00 GB",
             ),
         ] {
-            let told = limits.refusal(there, order).unwrap();
+            let told = limits.refusal("", there, order).unwrap();
             assert!(told.contains(reason), "{told}");
+            let told = limits.refusal("ada", there, order).unwrap();
+            assert!(told.starts_with("the farm takes no more of ada for now: "), "{told}");
         }
     }
 }

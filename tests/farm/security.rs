@@ -72,6 +72,63 @@ fn orders_have_a_budget_which_the_token_of_those_who_look_after_the_farm_exceeds
 }
 
 #[test]
+fn an_owner_at_the_limit_stops_no_other_and_jobs_are_those_of_the_tokens_owner() {
+    let place = Place::new();
+    let args = ["coordinator", "--listen", "127.0.0.1:0", "--state", "farm", "--most-jobs", "1"];
+    let mut coordinator = place.start("coordinator.log", &args);
+    let line = coordinator.read_line();
+    let tokens = |words: &[&str]| ask(&place, &[&["tokens"], words, &["--state", "farm"]].concat());
+    for owner in ["ada", "bo"] {
+        let (code, said) = tokens(&["renew", "submit", "--owner", owner]);
+        assert_eq!((code, said), (Some(0), format!("farm/access/submit.{owner}\n")));
+    }
+    for (owner, role, reason) in
+        [("a/b", "submit", "no owner's name"), ("ada", "work", "not to work")]
+    {
+        let (code, said) = tokens(&["renew", role, "--owner", owner]);
+        assert!(code == Some(2) && said.contains(reason), "{said}");
+    }
+    // A token that is new is known within a second.
+    poll(|| {
+        ask(&place, &["jobs", "--access", "farm/access/submit.bo"]).0.filter(|code| *code == 0)
+    });
+    let order = |holder: &str, owner: &[&str]| {
+        let access = format!("farm/access/{holder}");
+        let words = ["submit", "scene.rt", "-o", "out.png", "--size", "8x6", "--detach"];
+        ask(&place, &[&words[..], &["--access", &access], owner].concat())
+    };
+    assert_eq!(order("submit.ada", &["--owner", "bo"]).0, Some(0));
+    let (code, said) = order("submit.ada", &[]);
+    let reason = "the farm takes no more of ada for now: there are 1 jobs already, and may be 1";
+    assert!(code == Some(2) && said.contains(reason), "{said}");
+    for holder in ["submit.bo", "submit"] {
+        let (code, said) = order(holder, &["--owner", "ada"]);
+        assert_eq!(code, Some(0), "{said}");
+        assert_eq!(order(holder, &[]).0, Some(2), "{holder}: that is one job of theirs");
+    }
+    // Whose it is outlives the coordinator.
+    coordinator.child.kill().unwrap();
+    coordinator.wait();
+    let port = line.trim().rsplit(':').next().unwrap().to_owned();
+    let listen = format!("127.0.0.1:{port}");
+    let again = ["coordinator", "--listen", &listen, "--state", "farm", "--most-jobs", "1"];
+    let mut coordinator = place.start("again.log", &again);
+    coordinator.read_line();
+    assert_eq!(order("submit.ada", &[]).0, Some(2));
+    let (_, listed) = ask(&place, &["jobs", "--json", "--access", "farm/access/read"]);
+    let jobs: serde_json::Value = serde_json::from_str(&listed).unwrap();
+    let mut owners: Vec<&str> =
+        jobs.as_array().unwrap().iter().map(|job| job["owner"].as_str().unwrap()).collect();
+    owners.sort_unstable();
+    // Who has no token of their own may call themselves anything, at nobody's expense.
+    assert_eq!(owners, ["ada", "ada", "bo"]);
+    fs::copy(place.path("farm/access/submit.ada"), place.path("farm/access/copy")).unwrap();
+    assert_eq!(tokens(&["revoke", "submit", "--owner", "ada"]).0, Some(0));
+    assert!(!place.path("farm/access/submit.ada").exists());
+    poll(|| order("copy", &[]).1.contains("the token is not known").then_some(()));
+}
+
+#[test]
 fn a_farm_serves_those_who_have_a_token_while_others_storm_it() {
     let place = Place::new();
     let (mut coordinator, url) = start_farm(&place);
