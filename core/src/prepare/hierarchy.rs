@@ -4,9 +4,9 @@ use glam::DVec3;
 use rayon::prelude::*;
 
 use super::{
-    Form,
     bvh::{BuildPrimitive, Leaves, build_bvh},
     flat::bounds_of,
+    form::Form,
     surfaces::Surfaces,
 };
 use crate::{

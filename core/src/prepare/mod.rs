@@ -14,6 +14,7 @@ mod equal_spheres;
 mod error;
 mod features;
 mod flat;
+mod form;
 mod hierarchy;
 mod lights;
 pub(crate) mod mip_maps;
@@ -36,12 +37,12 @@ mod weld;
 use glam::DVec3;
 use rayon::prelude::*;
 
-pub use self::error::PrepareError;
 use self::{
     collect::Collected, emitters::Emitters, features::features, hierarchy::Hierarchy,
     lights::Lights, ranks::Ranks, scale::extent_of_eye_and_lights, single::split_vertices,
     textures::Textures,
 };
+pub use self::{error::PrepareError, form::Form};
 use crate::{
     prepared::{
         bytes::{PreparedBytes, assemble},
@@ -51,17 +52,6 @@ use crate::{
     },
     scene::{Scene, Viewport},
 };
-
-/// What a prepared scene is to be good at. Its pictures do not depend on it.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub enum Form {
-    /// It is traced fast.
-    #[default]
-    Fast,
-    /// It takes little memory: its leaves hold more faces, the boxes of its hierarchy have 8 bits a
-    /// bound, and vertices that single precision holds exactly are kept in it.
-    Compact,
-}
 
 /// Turns a scene into a prepared scene, on rayon's threads; the same scene gives the same bytes on
 /// any number of them.

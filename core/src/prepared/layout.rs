@@ -174,13 +174,16 @@ impl<'a> View<'a> {
 
     /// A node of the hierarchy, which is compact or not; a compact one is expanded into `room`.
     #[inline(always)]
-    pub(crate) fn node<'n>(&self, index: usize, room: &'n mut Option<Node>) -> &'n Node
+    pub(crate) fn node<'n>(&self, index: usize, room: &'n mut Node) -> &'n Node
     where
         'a: 'n,
     {
         match self.sections.nodes.get(index) {
             Some(node) => node,
-            None => room.insert(self.compact_nodes[index].expand()),
+            None => {
+                self.compact_nodes[index].expand_into(room);
+                room
+            }
         }
     }
 

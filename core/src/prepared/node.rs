@@ -139,19 +139,25 @@ impl CompactNode {
         compact
     }
 
-    /// The node with these boxes.
+    /// Makes `node` the one with these boxes, in place: to move it would cost as much again.
     #[inline(always)]
-    pub(crate) fn expand(&self) -> Node {
-        let mut node = Node { children: self.children, ..Node::EMPTY };
+    pub(super) fn expand_into(&self, node: &mut Node) {
+        node.children = self.children;
         for side in 0..6 {
             let (origin, exponent) = (self.origin[side % 3], self.exponents[side % 3]);
             for child in 0..8 {
                 let plane = plane_at(origin, exponent, self.planes[side][child]);
-                if self.children[child] != Child::NONE {
-                    node.planes[side][child] = plane;
-                }
+                let is_used = self.children[child] != Child::NONE;
+                let unused = Node::EMPTY.planes[side][child];
+                node.planes[side][child] = if is_used { plane } else { unused };
             }
         }
+    }
+
+    /// The node with these boxes.
+    pub(super) fn expand(&self) -> Node {
+        let mut node = Node::EMPTY;
+        self.expand_into(&mut node);
         node
     }
 }

@@ -19,7 +19,7 @@ use super::{
 };
 use crate::prepared::{
     layout::View,
-    node::{Child, Frame},
+    node::{Child, Frame, Node},
     record::{Item, Kind},
 };
 
@@ -38,13 +38,13 @@ pub(super) struct Packet {
     pub(super) alive: u64,
 }
 
-/// Children that wait, each with where it begins and the rays that enter it.
+/// Room for children that wait, each with where it begins and the rays that enter it, and for a node.
 #[derive(Debug)]
-pub(super) struct PacketStack([(f32, Child, u64); STACK]);
+pub(super) struct PacketStack([(f32, Child, u64); STACK], Node);
 
 impl Default for PacketStack {
     fn default() -> Self {
-        Self([(0.0, Child::NONE, 0); STACK])
+        Self([(0.0, Child::NONE, 0); STACK], Node::EMPTY)
     }
 }
 
@@ -353,7 +353,7 @@ pub(super) fn visit_packet(
     kernel: impl BoxKernel,
     view: &View<'_>,
     packet: &mut Packet,
-    (PacketStack(stack), alone): (&mut PacketStack, &mut Stack),
+    (PacketStack(stack, room), alone): (&mut PacketStack, &mut Stack),
     meeting: &mut impl Meeting,
 ) {
     let mut waiting = 0;
@@ -367,7 +367,6 @@ pub(super) fn visit_packet(
             }
             packet.shorten_beam();
         } else {
-            let room = &mut None;
             let node = view.node(current.node(), room);
             let (nears, mut met) = kernel.meet_beam(node, &packet.beam);
             let first = waiting;

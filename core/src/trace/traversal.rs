@@ -3,20 +3,20 @@
 use super::{box_ray::BoxRay, boxes::BoxKernel, ray::Ray};
 use crate::prepared::{
     layout::View,
-    node::{Child, MOST_LEVELS},
+    node::{Child, MOST_LEVELS, Node},
     record::Item,
 };
 
 /// Children that may wait while a ray visits others: seven on each level and the last node's.
 pub(super) const STACK: usize = 7 * MOST_LEVELS + 8;
 
-/// Room for them, kept from ray to ray: to fill it anew for each would cost as much as the ray.
+/// Room for them and for a node, kept from ray to ray: to fill it anew for each would cost as much as the ray.
 #[derive(Debug)]
-pub(super) struct Stack([(f32, Child); STACK]);
+pub(super) struct Stack([(f32, Child); STACK], Node);
 
 impl Default for Stack {
     fn default() -> Self {
-        Self([(0.0, Child::NONE); STACK])
+        Self([(0.0, Child::NONE); STACK], Node::EMPTY)
     }
 }
 
@@ -63,7 +63,7 @@ pub(super) fn visit_from(
     kernel: impl BoxKernel,
     view: &View<'_>,
     (box_ray, mut current): (&mut BoxRay, Child),
-    Stack(stack): &mut Stack,
+    Stack(stack, room): &mut Stack,
     mut enter: impl FnMut(),
     mut meet: impl FnMut(Item, &BoxRay) -> Step,
 ) -> bool {
@@ -79,7 +79,6 @@ pub(super) fn visit_from(
             }
         } else {
             enter();
-            let room = &mut None;
             let node = view.node(current.node(), room);
             let (distances, mut mask) = kernel.test(node, box_ray);
             let first = waiting;

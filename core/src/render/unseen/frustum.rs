@@ -8,7 +8,7 @@ use super::{
 };
 use crate::prepared::{
     layout::View,
-    node::{Child, Frame},
+    node::{Child, Frame, Node},
 };
 
 /// Room for rounding in the test of a box, relative to its terms; rounding is 2^12 times finer.
@@ -36,6 +36,7 @@ impl FrustumSearch {
         self.waiting.clear();
         self.waiting.push(Child::ROOT);
         let frustum = Frustum::new(screen, &view.header.frame, beam);
+        let mut room = Node::EMPTY;
         while let Some(child) = self.waiting.pop() {
             if child.is_leaf() {
                 for item in view.items(child.items()) {
@@ -46,8 +47,7 @@ impl FrustumSearch {
                 }
                 continue;
             }
-            let room = &mut None;
-            let node = view.node(child.node(), room);
+            let node = view.node(child.node(), &mut room);
             let mut mask = frustum.boxes_met(&node.planes);
             while mask != 0 {
                 let child = node.children[mask.trailing_zeros() as usize & 7];
