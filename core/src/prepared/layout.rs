@@ -178,13 +178,11 @@ impl<'a> View<'a> {
     where
         'a: 'n,
     {
-        match self.sections.nodes.get(index) {
-            Some(node) => node,
-            None => {
-                self.compact_nodes[index].expand_into(room);
-                room
-            }
+        if let Some(node) = self.sections.nodes.get(index) {
+            return node;
         }
+        self.compact_nodes[index].expand_into(room);
+        room
     }
 
     /// How many vertices there are.
