@@ -449,6 +449,7 @@ mod tests {
             quality: Quality::default(),
             tile_side: Some(64),
             transfer: Transfer::None,
+            form: rtfarm_core::prepare::Form::Fast,
             format: PictureFormat::Png8,
         };
         let order = request.place(SCENE.as_bytes(), &|_| unreachable!("it names no files"));
