@@ -1,11 +1,15 @@
 #!/usr/bin/env python3
-"""Time whole commands of rtfarm and POV-Ray on solids: the same samples, and as few as an error needs.
+"""Time whole commands of rtfarm and of other renderers: meshes and spheres beside Mitsuba, solids beside
+POV-Ray with the same samples, and with as few as an error needs.
 
-    python3 whole.py RTFARM CONVERTERS [--runs 3] [--only same|adaptive] [--quiet COMMAND]
+    python3 whole.py RTFARM CONVERTERS [--runs 3] [--only meshes|same|adaptive] [--quiet COMMAND]
 
-RTFARM is the program, CONVERTERS the folder with rt.py and to_pov.py. Prints two tables of medians of
-runs that take turns. Both programs have two threads, no secondary light, rtfarm's depth and linear
-light. POV-Ray's 17 samples are one and then 4 x 4; its adaptive ones are `+AM2`. An error is the root
+RTFARM is the program, CONVERTERS the folder with rt.py, to_pov.py, to_mitsuba.py, mitsuba_run.py and
+gen_scenes.py. Prints tables of medians of runs that take turns; one whose renderer is missing is
+skipped aloud. Mitsuba 3 is the wheel in the Python of MITSUBA_PYTHON (`llvm_ad_rgb`, kernels compiled
+before, rays of mirrors and glass alone), and rtfarm has its default workers beside it; memory is
+the greatest sum of the proportional set sizes (PSS) of all processes of one further run. On solids both
+programs have two threads, no secondary light, rtfarm's depth and linear light. POV-Ray's 17 samples are one and then 4 x 4; its adaptive ones are `+AM2`. An error is the root
 of the mean square against the program's own converged picture, in steps of 8 bits: POV-Ray's has
 9 x 9 samples in each quarter of a pixel, rtfarm's 1024 a pixel. Each POV-Ray row has beside it the
 coarsest `--error` of a ladder by sqrt(2) that comes at least as near. COMMAND is put before each
@@ -16,6 +20,7 @@ import json
 import os
 import re
 import shlex
+import shutil
 import statistics
 import struct
 import subprocess
@@ -24,9 +29,13 @@ import tempfile
 import time
 import zlib
 
-from run import by_lines
+from run import PYTHON, by_lines
 
 SCENES = os.path.join(os.path.dirname(os.path.abspath(__file__)), '..', '..', 'scenes')
+MESHES = [('bottle, 100 000 triangles, front', 'bottle 100000 --view front', [1, 16]),
+          ('bottle, 100 000 triangles, filling the frame', 'bottle 100000 --view fill', [1, 16]),
+          ('bottle, 1 000 000 triangles, front', 'bottle 1000000 --view front', [1, 16]),
+          ('100 000 spheres', 'spheres 100000', [1, 16])]
 SAME = [('gnome', 640, 360), ('gnome', 1280, 720), ('solids', 640, 360)]
 GRID = '+A0.0 +AM1 +R4 -J'
 ADAPTIVE = ['+A0.3 +AM2 +R2 -J', '+A0.1 +AM2 +R3 -J', '+A0.03 +AM2 +R4 -J', '+A0.01 +AM2 +R5 -J']
@@ -85,6 +94,36 @@ def run(command):
     return wall, sum(after[2:4]) - sum(before[2:4])
 
 
+def processes(root):
+    """A process and all that descend from it."""
+    children, found = {}, [root]
+    for pid in filter(str.isdigit, os.listdir('/proc')):
+        try:
+            with open(f'/proc/{pid}/stat') as f:
+                children.setdefault(int(f.read().rsplit(')', 1)[1].split()[1]), []).append(int(pid))
+        except OSError:
+            pass
+    for pid in found:
+        found += children.get(pid, [])
+    return found
+
+
+def peak_memory(command):
+    """The greatest sum of the proportional set sizes of all processes of a command, in megabytes."""
+    most, process = 0, subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    while process.poll() is None:
+        sum_now = 0
+        for pid in processes(process.pid):
+            try:
+                with open(f'/proc/{pid}/smaps_rollup') as f:
+                    sum_now += int(re.search(r'^Pss: *(\d+)', f.read(), re.M)[1])
+            except (OSError, TypeError):
+                pass
+        most = max(most, sum_now)
+        time.sleep(0.01)
+    return most * 1024 / 1e6
+
+
 class Bench:
     def __init__(self, args, folder):
         self.args, self.folder = args, folder
@@ -123,6 +162,33 @@ class Bench:
         runs = [self.timed(commands) for _ in range(self.args.runs)]
         return [[statistics.median(times) for times in zip(*of)] for of in zip(*runs)]
 
+    def meshes(self):
+        if subprocess.run([PYTHON, '-c', 'import mitsuba'], stderr=subprocess.DEVNULL).returncode:
+            return skip('meshes: there is no Mitsuba in the Python of MITSUBA_PYTHON')
+        converter = lambda name: os.path.join(self.args.converters, name)
+        print('| 1280 x 720 | samples | Mitsuba: wall, processor s; MB | rtfarm | Mitsuba / rtfarm |'
+              '\n|---|---|---|---|---|')
+        # Not beside the links to the project's scenes, which are written through.
+        made = os.path.join(self.folder, 'made')
+        os.mkdir(made)
+        for name, scene, counts in MESHES:
+            kind, count, *view = scene.split()
+            source = os.path.join(made, kind + '.rt')
+            run([sys.executable, converter('gen_scenes.py'), kind, count, source, *view])
+            for samples in counts:
+                xml = os.path.join(made, kind + '.xml')
+                run([sys.executable, converter('to_mitsuba.py'), source, xml, '1280', '720', '--spp', str(samples)])
+                peer = [PYTHON, converter('mitsuba_run.py'), xml, self.picture('mitsuba', 'mesh'), '--whitted', '9']
+                own = [self.args.rtfarm, 'render', source, '-o', self.picture('rtfarm', 'mesh'), '--size', '1280x720',
+                       '--samples', str(samples), '--secondary', 'off', '--no-cache']
+                memory = [peak_memory(command) for command in (peer, own)]
+                times = self.medians([peer, own])
+                cells = [f'{wall:.2f}, {processor:.2f}; {most:.0f}' for (wall, processor), most in zip(times, memory)]
+                ratios = [a / b for a, b in zip([*times[0], memory[0]], [*times[1], memory[1]])]
+                print(f'| {name} | {samples} | {cells[0]} | {cells[1]} '
+                      f'| {ratios[0]:.2f}, {ratios[1]:.2f}; {ratios[2]:.1f} |', flush=True)
+        print()
+
     def same_samples(self):
         print('| scene | POV-Ray, 17 samples: wall, processor s | rtfarm, 16 | rtfarm / POV-Ray |\n|---|---|---|---|')
         for scene, width, height in SAME:
@@ -157,6 +223,10 @@ class Bench:
                       f'| {255 * float(level):.2g}/255 | {reached[level]:.2f} | {own[0]:.2f}, {own[1]:.2f} |', flush=True)
 
 
+def skip(what):
+    print(f'SKIPPED: {what}', file=sys.stderr, flush=True)
+
+
 def main():
     if sys.argv[1:2] == ['--timed']:
         print(json.dumps([run(command) for command in json.loads(sys.argv[2])]))
@@ -165,13 +235,20 @@ def main():
     args.add_argument('rtfarm')
     args.add_argument('converters')
     args.add_argument('--runs', type=int, default=3)
-    args.add_argument('--only', choices=['same', 'adaptive'])
+    args.add_argument('--only', choices=['meshes', 'same', 'adaptive'])
     args.add_argument('--quiet', default='', metavar='COMMAND')
     args = args.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         bench = Bench(args, folder)
+        if args.only in (None, 'meshes'):
+            bench.meshes()
+        if args.only == 'meshes':
+            return
+        if not shutil.which('povray'):
+            return skip('solids: there is no povray')
         if args.only != 'adaptive':
             bench.same_samples()
+            print()
         if args.only != 'same':
             bench.adaptive()
 
