@@ -378,8 +378,8 @@ pub(crate) struct PictureArgs {
 
     /// Prepare the scene to take little memory; pictures are the same.
     ///
-    /// A triangle takes some 32 bytes instead of 55, or 38 where its corners are not exact in single
-    /// precision, as binary meshes have them.
+    /// A triangle takes some 32 bytes instead of 55; 38 if single precision does not hold its corners
+    /// exactly, as it does those of binary meshes. To prepare it takes as much memory as before.
     #[arg(long, help_heading = WORK)]
     pub(crate) compact: bool,
 
@@ -771,13 +771,6 @@ pub(crate) struct ImageArgs {
     /// Have the farm keep the picture.
     #[arg(long)]
     pub(crate) keep: bool,
-
-    /// Prepare the scene to take little memory; pictures are the same.
-    ///
-    /// A triangle takes some 32 bytes instead of 55, or 38 where its corners are not exact in single
-    /// precision, as binary meshes have them.
-    #[arg(long, help_heading = WORK)]
-    pub(crate) compact: bool,
 
     /// Say beside the picture, in FILE.json, how long and on which hosts it was rendered.
     ///

@@ -110,7 +110,7 @@ impl Cache {
     ) -> Option<Found> {
         let path = self.path(key);
         let bytes = fs::read(&path).ok()?;
-        let found = open_entry(&bytes, read);
+        let found = open_entry(key, &bytes, read);
         if found.is_some() {
             let now = Timespec { tv_sec: 0, tv_nsec: UTIME_NOW };
             // If it cannot be marked as used it goes sooner, which is all.
@@ -139,6 +139,7 @@ impl Cache {
         let files: Vec<_> =
             files.iter().map(|(name, hash)| json!([name, hash.to_hex().as_str()])).collect();
         let told = json!({
+            "key": key.to_hex().as_str(),
             "size": [size.width(), size.height()],
             "report": report,
             "files": files,
@@ -193,7 +194,11 @@ fn remove(path: &Path) -> io::Result<()> {
     }
 }
 
-fn open_entry(bytes: &[u8], read: impl Fn(&str) -> io::Result<Vec<u8>>) -> Option<Found> {
+fn open_entry(
+    key: &Hash,
+    bytes: &[u8],
+    read: impl Fn(&str) -> io::Result<Vec<u8>>,
+) -> Option<Found> {
     let end = bytes.iter().position(|&byte| byte == b'\n')?;
     let (line, prepared) = (str::from_utf8(&bytes[..end]).ok()?, &bytes[end + 1..]);
     let (hash, told) = line.split_once(' ')?;
@@ -201,6 +206,9 @@ fn open_entry(bytes: &[u8], read: impl Fn(&str) -> io::Result<Vec<u8>>) -> Optio
         return None;
     }
     let told: Value = serde_json::from_str(told).ok()?;
+    if told["key"].as_str()? != key.to_hex().as_str() {
+        return None;
+    }
     for file in told["files"].as_array()? {
         let (name, hash) = (file[0].as_str()?, Hash::from_hex(file[1].as_str()?).ok()?);
         if blake3::hash(&read(name).ok()?) != hash {
@@ -304,6 +312,9 @@ mod tests {
         }
         fs::write(&path, whole).unwrap();
         assert!(cache.find(&key, read).is_some());
+        let other = Cache::key("b.rt", b"text", TRANSFER, Form::Fast);
+        fs::copy(&path, cache.path(&other)).unwrap();
+        assert!(cache.find(&other, read).is_none(), "an entry under another's name");
     }
 
     #[test]

@@ -65,7 +65,7 @@ impl Resume {
                 }
             }
             Ok(_) => tracing::warn!(
-                "beginning anew, since {} is of another scene, other settings or another rtfarm",
+                "beginning anew, since {} is of another scene, other settings (as --compact) or another rtfarm",
                 folder.display()
             ),
             Err(error) if error.kind() == io::ErrorKind::NotFound => {}

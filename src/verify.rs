@@ -128,14 +128,15 @@ fn verify(
         }
     }
     let mut order = prepare(args, text, &provenance, Form::Fast)?;
-    if order.prepared.hash() != scene {
+    let plain = order.prepared.hash();
+    if plain != scene {
         order = prepare(args, text, &provenance, Form::Compact)?;
     }
     if order.prepared.hash() != scene {
         differences.push(format!(
-            "the scene differs: the picture says {scene}, {} is {}",
-            args.scene.name(),
-            order.prepared.hash()
+            "the scene differs: the picture says {scene}, {name} is {plain}, or {} with --compact",
+            order.prepared.hash(),
+            name = args.scene.name(),
         ));
     }
     let tile_count = grid.count();
