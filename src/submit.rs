@@ -134,18 +134,20 @@ impl Outside for Here<'_> {
         Output = Result<impl Stream<Item = wire::SubmitRequest> + Send + 'static, Trouble>,
     > + Send
     + 'static {
-        let (order, text, scene) =
+        let (mut order, text, scene) =
             (self.wire_order(), Arc::clone(&self.text), &self.args.picture.scene);
         let (scene_files, name) = (SceneFiles::new(scene), scene.name());
         async move {
             let files = spawn_blocking(move || {
                 let files = read_named_files(&text, &scene_files);
-                text.ensure_unchanged().map(|()| (text, files))
+                let hash = hash(&text, &files);
+                text.ensure_unchanged().map(|()| (text, files, hash))
             });
-            let (text, files) = files
+            let (text, files, hash) = files
                 .await
                 .expect("reading never panics")
                 .map_err(|error| Trouble::File(format!("cannot read the scene {name}: {error}")))?;
+            order.sent = hash.as_bytes().to_vec().into();
             Ok(parts(order, text, files))
         }
     }
@@ -214,8 +216,20 @@ impl Here<'_> {
             tile_side: request.tile_side.map_or(0, |side| side as u32),
             format: wire::Format::from(request.format).into(),
             transfer: wire::Transfer::from(request.transfer).into(),
+            sent: Vec::new().into(),
         }
     }
+}
+
+/// Tells a scene's text and its files from others.
+fn hash(text: &[u8], files: &BTreeMap<String, Vec<u8>>) -> blake3::Hash {
+    let mut hasher = blake3::Hasher::new();
+    hasher.update(blake3::hash(text).as_bytes());
+    for (path, data) in files {
+        hasher.update(blake3::hash(path.as_bytes()).as_bytes());
+        hasher.update(blake3::hash(data).as_bytes());
+    }
+    hasher.finalize()
 }
 
 /// The pieces of an order, of its scene and its files.

@@ -70,7 +70,7 @@ pub(crate) struct JobRecord {
     /// Who wants it.
     #[prost(string, tag = "7")]
     pub(crate) owner: String,
-    /// An order with the same is for the same job.
+    /// The same order with the same key is for the same job.
     #[prost(string, tag = "8")]
     pub(crate) key: String,
     #[prost(sint32, tag = "9")]
@@ -83,6 +83,9 @@ pub(crate) struct JobRecord {
     /// Whose budget it is in; empty: that of all who have no token of their own.
     #[prost(string, tag = "12")]
     pub(crate) account: String,
+    /// Tells what was ordered from what others order.
+    #[prost(bytes = "vec", tag = "13")]
+    pub(crate) wanted: Vec<u8>,
 }
 
 /// What a client says of a job besides what it renders.
@@ -94,8 +97,10 @@ pub(crate) struct Ticket {
     pub(crate) owner: String,
     /// Whose budget it is in: the owner of the token that it was ordered by; empty if that has none.
     pub(crate) account: String,
-    /// Another order with the same key is for the same job; empty if none is.
+    /// An order of the same account with the same key is for the same job; empty if none is.
     pub(crate) key: String,
+    /// Tells what it renders from what other orders with its key want.
+    pub(crate) wanted: Vec<u8>,
     pub(crate) priority: i32,
     /// That render it at the same time.
     pub(crate) most_workers: Option<u32>,
@@ -186,12 +191,13 @@ impl JobRecord {
             tile_side: grid.side(),
             window: Some(Crop::from(grid.window()).into()),
         };
-        let Ticket { name, owner, account, key, priority, most_workers } = ticket.clone();
+        let Ticket { name, owner, account, key, wanted, priority, most_workers } = ticket.clone();
         Self {
             name,
             owner,
             account,
             key,
+            wanted,
             priority,
             is_paused: false,
             most_workers: most_workers.unwrap_or(0),
@@ -204,9 +210,9 @@ impl JobRecord {
     }
 
     pub(crate) fn ticket(&self) -> Ticket {
-        let Self { name, owner, account, key, priority, most_workers, .. } = self.clone();
+        let Self { name, owner, account, key, wanted, priority, most_workers, .. } = self.clone();
         let most_workers = (most_workers > 0).then_some(most_workers);
-        Ticket { name, owner, account, key, priority, most_workers }
+        Ticket { name, owner, account, key, wanted, priority, most_workers }
     }
 
     pub(crate) fn plan(&self) -> Result<Plan, RecordError> {

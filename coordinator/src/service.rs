@@ -9,6 +9,7 @@ use std::{
     time::Duration,
 };
 
+use prost::Message;
 use rtfarm_core::{
     language::{Style, draw_diagnostics},
     prepare::Form,
@@ -291,12 +292,12 @@ impl jobs_server::Jobs for JobsService {
     ) -> Result<Response<wire::SubmitResponse>, Status> {
         let holder = request.extensions().get::<Holder>().cloned();
         let is_admin = holder.as_ref().is_some_and(|holder| holder.role() == Role::Admin);
-        let bundle = match receive(request.into_inner(), &self.shell, &self.uploads).await? {
+        let owner = holder.as_ref().and_then(Holder::owner);
+        let bundle = match receive(request.into_inner(), owner, &self.shell, &self.uploads).await? {
             Received::Known(job) => return Ok(Response::new(accepted(&job, &self.shell))),
             Received::New(bundle) => bundle,
         };
-        let Bundle { order, spool } = *bundle;
-        let ticket = to_ticket(&order, holder.as_ref().and_then(Holder::owner));
+        let Bundle { order, ticket, spool } = *bundle;
         let wanted = to_request(order).map_err(invalid)?;
         let shell = Arc::clone(&self.shell);
         let client_gone = CancellationToken::new();
@@ -637,6 +638,7 @@ fn to_explanation(
 /// A scene as a client sends it.
 struct Bundle {
     order: wire::Order,
+    ticket: Ticket,
     spool: Spool,
 }
 
@@ -674,6 +676,7 @@ enum Received {
 
 async fn receive(
     parts: Streaming<wire::SubmitRequest>,
+    holder: Option<&Owner>,
     shell: &Shell,
     uploads: &Uploads,
 ) -> Result<Received, Status> {
@@ -686,7 +689,9 @@ async fn receive(
         return Err(invalid(WireError::Missing("order")));
     };
     check_version("client", &order.version, order.protocol, shell)?;
-    if let Some(job) = shell.claim(&order.key) {
+    let ticket = to_ticket(&order, holder);
+    let claimed = shell.claim(&ticket);
+    if let Some(job) = claimed.map_err(|error| Status::already_exists(error.to_string()))? {
         return Ok(Received::Known(job));
     }
     let mut spool = Spool::new(&shell.config.scene_folder, uploads);
@@ -720,7 +725,7 @@ async fn receive(
         }
     }
     let spool = spool.map_err(|error| cannot_spool(&error))?;
-    Ok(Received::New(Box::new(Bundle { order, spool })))
+    Ok(Received::New(Box::new(Bundle { order, ticket, spool })))
 }
 
 /// What a client sends, piece by piece.
@@ -749,7 +754,15 @@ fn to_ticket(order: &wire::Order, holder: Option<&Owner>) -> Ticket {
     let most_workers = (max_workers > 0).then_some(max_workers);
     let account = holder.map(Owner::to_string).unwrap_or_default();
     let owner = if account.is_empty() { owner } else { account.clone() };
-    Ticket { name, owner, account, key, priority, most_workers }
+    let wanted = blake3::hash(&wanted(order.clone()).encode_to_vec()).as_bytes().to_vec();
+    Ticket { name, owner, account, key, wanted, priority, most_workers }
+}
+
+/// What an order says of the picture, without who wants it and how.
+fn wanted(order: wire::Order) -> wire::Order {
+    let [version, name, title, owner, key] = [(); 5].map(|()| String::new());
+    let (protocol, priority, max_workers) = (0, 0, 0);
+    wire::Order { version, protocol, name, title, owner, key, priority, max_workers, ..order }
 }
 
 fn to_request(order: wire::Order) -> Result<RenderRequest, WireError> {

@@ -85,6 +85,11 @@ pub enum SubmitError {
     /// The job cannot be kept.
     #[error("cannot keep the job in the farm's state: {0}")]
     State(io::Error),
+    /// A job has the order's key, and renders something else.
+    #[error(
+        "job {0} has the key `{1}` and is another order; with another key this one gets a job of its own"
+    )]
+    Key(JobId, String),
 }
 
 /// Why a job is not changed.
@@ -553,7 +558,7 @@ impl Shell {
     /// call it on the async runtime.
     pub(crate) fn submit(&self, order: Order, ticket: Ticket) -> Result<Arc<Job>, SubmitError> {
         let _alone = self.changing.lock().expect("writing never panics");
-        if let Some(job) = self.claim(&ticket.key) {
+        if let Some(job) = self.claim(&ticket)? {
             return Ok(job);
         }
         let id = self.state().farm.number_job();
@@ -577,15 +582,24 @@ impl Shell {
         Ok(job)
     }
 
-    /// The job of an earlier order with this key, which another client is told of now.
-    pub(crate) fn claim(&self, key: &str) -> Option<Arc<Job>> {
+    /// The job that the account's earlier order with the same key has, which another client is told of
+    /// now. It fails if that order was another one.
+    pub(crate) fn claim(&self, ticket: &Ticket) -> Result<Option<Arc<Job>>, SubmitError> {
+        let Ticket { account, key, wanted, .. } = ticket;
+        let has_key = |of: &Ticket| !key.is_empty() && (&of.account, &of.key) == (account, key);
         self.tell(|state, _| {
-            let job = state.jobs.values().find(|job| !key.is_empty() && job.ticket.key == key);
-            let job = job.cloned();
-            if let Some(job) = &job {
-                state.farm.on_claim(job.id);
-            }
-            (job, Vec::new())
+            let job = state.jobs.values().find(|job| has_key(&job.ticket)).cloned();
+            let claimed = match job {
+                Some(job) if job.ticket.wanted != *wanted => {
+                    Err(SubmitError::Key(job.id, key.clone()))
+                }
+                Some(job) => {
+                    state.farm.on_claim(job.id);
+                    Ok(Some(job))
+                }
+                None => Ok(None),
+            };
+            (claimed, Vec::new())
         })
     }
 

@@ -129,6 +129,45 @@ fn an_owner_at_the_limit_stops_no_other_and_jobs_are_those_of_the_tokens_owner()
 }
 
 #[test]
+fn a_key_is_its_accounts_own_and_stands_for_one_order() {
+    let place = Place::new();
+    let (_coordinator, _) = start_farm(&place);
+    for owner in ["ada", "bo"] {
+        let words = ["tokens", "renew", "submit", "--owner", owner, "--state", "farm"];
+        assert_eq!(ask(&place, &words).0, Some(0));
+    }
+    poll(|| {
+        ask(&place, &["jobs", "--access", "farm/access/submit.bo"]).0.filter(|code| *code == 0)
+    });
+    let order = |holder: &str, more: &[&str]| {
+        let access = format!("farm/access/{holder}");
+        let words = ["submit", "-o", "out.png", "--detach", "--key", "k1", "--access", &access];
+        ask(&place, &[&words[..], more].concat())
+    };
+    let scene = ["scene.rt", "--size", "8x6"];
+    let of_ada = order("submit.ada", &scene);
+    assert_eq!(of_ada.0, Some(0), "{}", of_ada.1);
+    assert_eq!(
+        order("submit.ada", &[&scene[..], &["--name", "b", "--priority", "1"]].concat()),
+        of_ada
+    );
+    for holder in ["submit.bo", "submit"] {
+        let of_other = order(holder, &scene);
+        assert!(of_other.0 == Some(0) && of_other.1 != of_ada.1, "{holder}: {}", of_other.1);
+    }
+    fs::write(place.path("other.rt"), scene_text().replace("20 30 40", "30 30 40")).unwrap();
+    for other in [
+        vec!["scene.rt", "--size", "8x8"],
+        vec!["other.rt", "--size", "8x6"],
+        [&scene[..], &["--samples", "2"]].concat(),
+    ] {
+        let (code, said) = order("submit.ada", &other);
+        let reason = format!("job {} has the key `k1` and is another order", of_ada.1.trim());
+        assert!(code == Some(1) && said.contains(&reason), "{other:?}: {code:?} {said}");
+    }
+}
+
+#[test]
 fn a_farm_serves_those_who_have_a_token_while_others_storm_it() {
     let place = Place::new();
     let (mut coordinator, url) = start_farm(&place);
