@@ -140,12 +140,13 @@ impl Signals {
     /// Listens from now on. An interruption of a process that is to end already ends it at once.
     fn listen() -> Result<Self, Failure> {
         let (stop, terminate) = (CancellationToken::new(), CancellationToken::new());
-        for kind in [SignalKind::interrupt(), SignalKind::terminate(), SignalKind::hangup()] {
+        let [interrupt, quit] = [SignalKind::interrupt(), SignalKind::quit()];
+        for kind in [interrupt, quit, SignalKind::terminate(), SignalKind::hangup()] {
             let mut signals = signal(kind)?;
             let (stop, terminate) = (stop.clone(), terminate.clone());
             tokio::spawn(async move {
                 while signals.recv().await.is_some() {
-                    if stop.is_cancelled() && kind == SignalKind::interrupt() {
+                    if stop.is_cancelled() && [interrupt, quit].contains(&kind) {
                         std::process::exit(failure::INTERRUPTED.into());
                     }
                     if kind == SignalKind::terminate() {

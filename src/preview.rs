@@ -17,7 +17,7 @@ use tokio::{
 };
 use tokio_util::sync::CancellationToken;
 
-use crate::{console::Console, terminal::Graphics};
+use crate::{console::Console, failure::Failure, terminal::Graphics};
 
 /// The picture is drawn so often, if there is more to see.
 const PERIOD: Duration = Duration::from_millis(500);
@@ -39,14 +39,19 @@ pub(crate) struct Screen {
 
 impl Screen {
     /// The terminal at standard error; `None`, which is told, where it shows no pictures.
-    pub(crate) async fn open(console: &Console) -> Option<Self> {
-        match spawn_blocking(Graphics::detect).await.expect("nothing here panics") {
+    pub(crate) async fn open(
+        console: &Console,
+        stop: &CancellationToken,
+    ) -> Result<Option<Self>, Failure> {
+        let found = stop.run_until_cancelled(Graphics::detect()).await;
+        match found.ok_or(Failure::Interrupted)? {
             Ok(graphics) => {
-                Some(Self { graphics, console: console.clone(), count: AtomicU32::new(0) })
+                let console = console.clone();
+                Ok(Some(Self { graphics, console, count: AtomicU32::new(0) }))
             }
             Err(reason) => {
                 tracing::warn!("there is no preview: {reason}");
-                None
+                Ok(None)
             }
         }
     }

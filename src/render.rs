@@ -245,10 +245,12 @@ pub(crate) async fn run(
         output.check()?;
         wanted.push_back((picture, output));
     }
-    let screen = if args.preview { Screen::open(console).await } else { None };
     let told = started.into();
-    let mut render = Render { args: &args, console, stop, coordinator: None, screen, told };
+    let mut render = Render { args: &args, console, stop, coordinator: None, screen: None, told };
     let Some(first) = render.place_next(&mut wanted).await? else { return Ok(()) };
+    if args.preview {
+        render.screen = Screen::open(console, stop).await?;
+    }
     match args.workers_and_threads() {
         (0, _) if args.slurm.is_none() => {
             let (last, end) = render.all_but_the_last(first, wanted).await?;

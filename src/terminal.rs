@@ -7,18 +7,21 @@ use icy_sixel::{EncodeOptions, sixel_encode};
 use rtfarm_core::tile::Area;
 use rtfarm_picture::{View, encode_screen};
 use rustix::{
-    event::{PollFd, PollFlags, Timespec, poll},
     fs::{Mode, OFlags, open},
+    io::Errno,
     process::getpgrp,
     termios::{
         LocalModes, OptionalActions, Termios, isatty, tcgetattr, tcgetpgrp, tcgetwinsize,
         tcsetattr, ttyname,
     },
 };
-use tokio::time::Instant;
+use tokio::time::{sleep, timeout};
 
 /// A terminal that has not answered after so long does not answer.
 const PATIENCE: Duration = Duration::from_millis(500);
+
+/// It is looked so often whether it has.
+const PAUSE: Duration = Duration::from_millis(5);
 
 /// The most pixels across and down of a picture that is shown: a coarse one is sent quickly.
 const MOST_PIXELS: [u32; 2] = [400, 300];
@@ -72,15 +75,15 @@ pub(crate) struct Drawing {
 
 impl Graphics {
     /// What the terminal at standard error shows pictures by. It may be asked, and then has half a
-    /// second to answer: never call this on the async runtime.
-    pub(crate) fn detect() -> Found {
+    /// second to answer; when this is dropped before, the terminal is as it was.
+    pub(crate) async fn detect() -> Found {
         let stderr = io::stderr();
         if !isatty(&stderr) {
             return Err(NoGraphics::NoTerminal);
         }
         match known(|name| env::var(name).ok()) {
             Some(known) => known,
-            None => ask(&stderr).unwrap_or(Err(NoGraphics::Unknown)),
+            None => ask(&stderr).await.unwrap_or(Err(NoGraphics::Unknown)),
         }
     }
 
@@ -184,7 +187,7 @@ fn known(variable: impl Fn(&str) -> Option<String>) -> Option<Found> {
 }
 
 /// Asks a terminal.
-fn ask(terminal: &io::Stderr) -> io::Result<Found> {
+async fn ask(terminal: &io::Stderr) -> io::Result<Found> {
     let name = ttyname(terminal, Vec::new())?;
     let flags = OFlags::RDWR | OFlags::NOCTTY | OFlags::NONBLOCK | OFlags::CLOEXEC;
     let terminal = File::from(open(OsStr::from_bytes(name.as_bytes()), flags, Mode::empty())?);
@@ -194,7 +197,7 @@ fn ask(terminal: &io::Stderr) -> io::Result<Found> {
     }
     let asked = Asked::open(terminal)?;
     rustix::io::write(&asked.terminal, QUESTION)?;
-    asked.answer()
+    timeout(PATIENCE, asked.answer()).await.unwrap_or(Ok(Err(NoGraphics::Unknown)))
 }
 
 /// A terminal that does not show what it answers, as long as this lives.
@@ -212,18 +215,18 @@ impl Asked {
         Ok(Self { terminal, before })
     }
 
-    /// Reads until the last answer has come, or the terminal's time is over.
-    fn answer(&self) -> io::Result<Found> {
-        let (end, mut said) = (Instant::now() + PATIENCE, Vec::new());
+    /// Reads until the last answer has come.
+    async fn answer(&self) -> io::Result<Found> {
+        let mut said = Vec::new();
         loop {
-            let left = end.saturating_duration_since(Instant::now());
-            let wait = Timespec { tv_sec: 0, tv_nsec: left.as_nanos() as i64 };
-            let mut waited = [PollFd::new(&self.terminal, PollFlags::IN)];
-            if left.is_zero() || poll(&mut waited, Some(&wait))? == 0 {
-                return Ok(Err(NoGraphics::Unknown));
-            }
             let mut bytes = [0; 256];
-            let count = rustix::io::read(&self.terminal, &mut bytes)?;
+            let count = match rustix::io::read(&self.terminal, &mut bytes) {
+                Err(Errno::AGAIN) => {
+                    sleep(PAUSE).await;
+                    continue;
+                }
+                read => read?,
+            };
             said.extend_from_slice(&bytes[..count]);
             if let Some(found) = graphics(&said) {
                 return Ok(found);

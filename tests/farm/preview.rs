@@ -22,6 +22,43 @@ const ROOM: Winsize = Winsize { ws_col: 100, ws_row: 50, ws_xpixel: 800, ws_ypix
 /// What a terminal answers when it is asked what it can do.
 const QUESTION: &[u8] = b"\x1b[c";
 
+/// Both ends of a terminal.
+fn open() -> (File, File) {
+    let outside = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY).unwrap();
+    grantpt(&outside).unwrap();
+    unlockpt(&outside).unwrap();
+    tcsetwinsize(&outside, ROOM).unwrap();
+    let name = ptsname(&outside, Vec::new()).unwrap();
+    let path = Path::new(std::ffi::OsStr::from_bytes(name.as_bytes())).to_owned();
+    let inside = File::options().read(true).write(true).open(path).unwrap();
+    (outside.into(), inside)
+}
+
+/// How a terminal is set.
+fn settings(inside: &File) -> String {
+    format!("{:?}", tcgetattr(inside).unwrap())
+}
+
+/// Renders a scene with a preview in this terminal.
+fn render(place: &Place, scene: &str, inside: &File) -> Command {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_rtfarm"));
+    command
+        .args(["render", scene, "-o", "out.png", "--size", "640x480", "--samples", "4"])
+        .args(["--preview"])
+        .current_dir(place.folder.path())
+        .env("TMPDIR", place.path("tmp"))
+        .env("TERM", "xterm-256color")
+        .env("NO_COLOR", "1")
+        .env_remove("RUST_LOG")
+        .env_remove("TMUX")
+        .env_remove("TERM_PROGRAM")
+        .env_remove("LC_TERMINAL")
+        .stdin(Stdio::null())
+        .stdout(Stdio::null())
+        .stderr(inside.try_clone().unwrap());
+    command
+}
+
 /// A terminal: what is written to it is kept.
 struct Terminal {
     /// The end that a program has.
@@ -32,15 +69,9 @@ struct Terminal {
 impl Terminal {
     /// Answers so when it is asked.
     fn new(answer: &'static str) -> Self {
-        let outside = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY).unwrap();
-        grantpt(&outside).unwrap();
-        unlockpt(&outside).unwrap();
-        tcsetwinsize(&outside, ROOM).unwrap();
-        let name = ptsname(&outside, Vec::new()).unwrap();
-        let path = Path::new(std::ffi::OsStr::from_bytes(name.as_bytes())).to_owned();
-        let inside = File::options().read(true).write(true).open(path).unwrap();
+        let (outside, inside) = open();
         let reading = thread::spawn(move || {
-            let (mut outside, mut said, mut is_asked) = (File::from(outside), Vec::new(), false);
+            let (mut outside, mut said, mut is_asked) = (outside, Vec::new(), false);
             let mut bytes = [0; 4096];
             // Once nobody has the inside any more this fails.
             while let Ok(count @ 1..) = outside.read(&mut bytes) {
@@ -59,31 +90,12 @@ impl Terminal {
     fn render(self, variables: &[(&str, &str)], options: &[&str]) -> (String, RgbImage) {
         let Self { inside, reading } = self;
         let place = Place::new();
-        let before = format!("{:?}", tcgetattr(&inside).unwrap());
-        let status = Command::new(env!("CARGO_BIN_EXE_rtfarm"))
-            .args(["render", "scene.rt", "-o", "out.png", "--size", "640x480", "--samples", "4"])
-            .args(["--preview"])
-            .args(options)
-            .current_dir(place.folder.path())
-            .env("TMPDIR", place.path("tmp"))
-            .env("TERM", "xterm-256color")
-            .env("NO_COLOR", "1")
-            .env_remove("RUST_LOG")
-            .env_remove("TMUX")
-            .env_remove("TERM_PROGRAM")
-            .env_remove("LC_TERMINAL")
-            .envs(variables.iter().copied())
-            .stdin(Stdio::null())
-            .stdout(Stdio::null())
-            .stderr(inside.try_clone().unwrap())
-            .status()
-            .unwrap();
+        let before = settings(&inside);
+        let mut command = render(&place, "scene.rt", &inside);
+        let status = command.args(options).envs(variables.iter().copied()).status().unwrap();
         assert!(status.success());
-        assert_eq!(
-            format!("{:?}", tcgetattr(&inside).unwrap()),
-            before,
-            "the terminal is as it was"
-        );
+        assert_eq!(settings(&inside), before, "the terminal is as it was");
+        drop(command);
         drop(inside);
         let said = String::from_utf8(reading.join().unwrap()).unwrap();
         (said, image::open(place.path("out.png")).unwrap().into_rgb8())
@@ -171,4 +183,31 @@ fn who_shows_no_pictures_is_told_of_in_one_line_and_gets_the_file() {
     let log = process.log();
     assert!(log.contains("there is no preview: standard error is not a terminal"), "{log}");
     place.check_nothing_is_left();
+}
+
+#[test]
+fn an_interruption_while_the_terminal_is_asked_leaves_it_as_it_was() {
+    for signals in [[Signal::INT, Signal::INT], [Signal::INT, Signal::QUIT], [Signal::QUIT; 2]] {
+        let ((_outside, inside), place) = (open(), Place::new());
+        let before = settings(&inside);
+        let mut child = render(&place, "scene.rt", &inside).spawn().unwrap();
+        poll(|| (settings(&inside) != before).then_some(()));
+        for signal in signals {
+            kill_process(pid(child.id()), signal).unwrap();
+            thread::sleep(Duration::from_millis(50));
+        }
+        let status = child.wait().unwrap();
+        assert_eq!(settings(&inside), before, "{signals:?}: the terminal is as it was");
+        assert_eq!(status.code(), Some(130), "{signals:?}");
+    }
+}
+
+#[test]
+fn a_terminal_is_asked_once_the_scene_is_found_good() {
+    let (place, terminal) = (Place::new(), Terminal::new(""));
+    let mut command = render(&place, "missing.rt", &terminal.inside);
+    assert_eq!(command.status().unwrap().code(), Some(1));
+    drop((command, terminal.inside));
+    let said = String::from_utf8(terminal.reading.join().unwrap()).unwrap();
+    assert!(said.contains("missing.rt") && !said.contains("\x1b[c"), "{said:?}");
 }
