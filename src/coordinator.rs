@@ -11,8 +11,8 @@ use std::{
 
 use anyhow::{Context, anyhow};
 use rtfarm_coordinator::{
-    Config, Coordinator, Durability, Holder, Keeping, Listener, Security, StateError, StateFolder,
-    renew_token, revoke_token,
+    Config, Coordinator, Durability, Holder, Keeping, Listener, Owner, Role, Security,
+    SecurityError, StateError, StateFolder, renew_token, revoke_token,
 };
 use rtfarm_core::isa::Isa;
 use rtfarm_proto::Address;
@@ -181,9 +181,17 @@ pub(crate) fn change_tokens(args: &TokensArgs) -> Result<(), Failure> {
             path.display().to_string()
         }
         TokenChange::Revoke => {
-            revoke_token(state, &holder).map_err(anyhow::Error::from)?;
+            let others = revoke_token(state, &holder).map_err(|error| match error {
+                SecurityError::NoToken { .. } => Failure::Input(error.into()),
+                _ => Failure::Other(error.into()),
+            })?;
             match owner {
                 Some(owner) => format!("{owner} has no token to {role} any more"),
+                None if *role == Role::Submit && !others.is_empty() => {
+                    let others: Vec<String> = others.iter().map(Owner::to_string).collect();
+                    let others = others.join(", ");
+                    format!("the token to submit is void; owners' own are good as before: {others}")
+                }
                 None => format!("nobody has the token to {role} any more"),
             }
         }

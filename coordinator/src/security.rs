@@ -12,6 +12,7 @@
 //! Tokens are 32 random bytes: a plain hash of one tells nothing.
 
 use std::{
+    collections::BTreeSet,
     fmt,
     fs::{self, DirBuilder, Metadata},
     io::{self, Write},
@@ -116,7 +117,7 @@ impl FromStr for Role {
 }
 
 /// The name of one whose orders are counted by themselves: 1 to 32 letters, digits, `-` and `_`.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Owner(String);
 
 impl FromStr for Owner {
@@ -207,6 +208,24 @@ pub enum SecurityError {
     /// There is nothing to change.
     #[error("there are no tokens in {}: a coordinator makes them when it starts there", .0.display())]
     None(PathBuf),
+    /// An owner has no token to revoke.
+    #[error("{owner} has no token; {}", who_have(.others))]
+    NoToken {
+        /// The owner.
+        owner: Owner,
+        /// Those who have one, in alphabetical order.
+        others: Vec<Owner>,
+    },
+}
+
+/// Says that these, in this order, have something.
+fn who_have(owners: &[Owner]) -> String {
+    let names: Vec<&str> = owners.iter().map(|Owner(name)| &**name).collect();
+    match names.split_last() {
+        None => "no owner has".to_owned(),
+        Some((last, [])) => format!("{last} has"),
+        Some((last, others)) => format!("{} and {last} have", others.join(", ")),
+    }
 }
 
 /// The certificate and the tokens of a farm, in a folder.
@@ -334,18 +353,25 @@ pub fn renew_token(state: &Path, holder: &Holder) -> Result<PathBuf, SecurityErr
     renew_in(&of_state(state)?, holder)
 }
 
-/// Has a token not taken any more, and removes its access file.
-pub fn revoke_token(state: &Path, holder: &Holder) -> Result<(), SecurityError> {
+/// Has a token not taken any more, and removes its access file. Answers with the owners who have tokens
+/// of their own, which stay. It fails for an owner who has none.
+pub fn revoke_token(state: &Path, holder: &Holder) -> Result<Vec<Owner>, SecurityError> {
     let folder = of_state(state)?;
     let mut tokens = Tokens::read(&folder)?;
+    let is_known = tokens.hashes.iter().any(|(of, _)| of == holder);
     tokens.hashes.retain(|(of, _)| of != holder);
-    tokens.write(&folder)?;
+    let others = tokens.hashes.iter().filter_map(|(of, _)| of.owner.clone());
+    let others: Vec<Owner> = others.collect::<BTreeSet<_>>().into_iter().collect();
     let path = folder.join(holder.to_string());
+    if let Some(owner) = holder.owner.clone().filter(|_| !is_known && !path.exists()) {
+        return Err(SecurityError::NoToken { owner, others });
+    }
+    tokens.write(&folder)?;
     match fs::remove_file(&path) {
         Err(error) if error.kind() != io::ErrorKind::NotFound => {
             Err(SecurityError::Io(path, error))
         }
-        _ => Ok(()),
+        _ => Ok(others),
     }
 }
 
@@ -535,7 +561,11 @@ mod tests {
         }
         let old = access(state.path(), ada.clone());
         let of_bo = access(state.path(), bo.clone());
-        revoke_token(state.path(), &ada).unwrap();
+        let of_adda = revoke_token(state.path(), &holder("submit.adda")).unwrap_err();
+        assert_eq!(of_adda.to_string(), "adda has no token; ada and bo_2 have");
+        assert_eq!(revoke_token(state.path(), &ada).unwrap(), ["bo_2".parse().unwrap()]);
+        let of_ada = revoke_token(state.path(), &ada).unwrap_err();
+        assert_eq!(of_ada.to_string(), "ada has no token; bo_2 has");
         tokio::time::advance(REREAD).await;
         let code = check(&security, "/rtfarm.v1.Jobs/Submit", old.token().unwrap());
         assert_eq!(code, Some(Code::Unauthenticated));

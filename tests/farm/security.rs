@@ -123,6 +123,8 @@ fn an_owner_at_the_limit_stops_no_other_and_jobs_are_those_of_the_tokens_owner()
     // Who has no token of their own may call themselves anything, at nobody's expense.
     assert_eq!(owners, ["ada", "ada", "bo"]);
     fs::copy(place.path("farm/access/submit.ada"), place.path("farm/access/copy")).unwrap();
+    let (code, said) = tokens(&["revoke", "submit", "--owner", "adda"]);
+    assert!(code == Some(2) && said.contains("adda has no token; ada and bo have"), "{said}");
     assert_eq!(tokens(&["revoke", "submit", "--owner", "ada"]).0, Some(0));
     assert!(!place.path("farm/access/submit.ada").exists());
     poll(|| order("copy", &[]).1.contains("the token is not known").then_some(()));
