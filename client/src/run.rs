@@ -301,7 +301,11 @@ async fn tell<C>(reports: &Reports<C>, report: Result<Report<C>, Trouble>) {
 /// What a call failed of: the coordinator says it, or the connection.
 fn failed(status: &Status) -> Trouble {
     let reason = plain(status.message());
-    if is_lost(status) { Trouble::Lost(reason) } else { Trouble::Call(reason) }
+    match status.code() {
+        _ if is_lost(status) => Trouble::Lost(reason),
+        Code::Unauthenticated | Code::PermissionDenied => Trouble::Forbidden(reason),
+        _ => Trouble::Call(reason),
+    }
 }
 
 /// Says whether a call failed of its connection.

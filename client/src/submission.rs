@@ -141,6 +141,8 @@ pub enum Trouble {
     Connect(Address, String),
     /// The coordinator says why it does not do what was asked.
     Call(String),
+    /// The coordinator says why nothing is done for who has this token.
+    Forbidden(String),
     /// The connection has failed.
     Lost(String),
     /// A deadline has passed.
@@ -159,7 +161,9 @@ impl fmt::Display for Trouble {
             Self::Connect(address, reason) => {
                 write!(f, "no coordinator answers at {address}: {reason}")
             }
-            Self::Call(reason) => write!(f, "the coordinator says: {reason}"),
+            Self::Call(reason) | Self::Forbidden(reason) => {
+                write!(f, "the coordinator says: {reason}")
+            }
             Self::Lost(reason) => write!(f, "the connection to the coordinator is lost: {reason}"),
             Self::Late => f.write_str("the coordinator does not answer"),
             Self::Gone => f.write_str("the coordinator is gone"),
@@ -376,6 +380,19 @@ impl Submission {
     pub(crate) fn on_trouble(&mut self, trouble: Trouble, now: Instant) {
         match (&self.stage, trouble) {
             (Stage::Cancelling { .. }, _) => self.end_as_cancelled(),
+            // It cannot be forgotten either.
+            (
+                Stage::Watching { job, .. }
+                | Stage::Fetching { job, .. }
+                | Stage::Reconnecting { job: Some((job, _)), .. },
+                trouble @ Trouble::Forbidden(_),
+            ) => {
+                let (job, coordinator) = (*job, &self.coordinator);
+                self.end(Err(NoPicture::Failed(format!(
+                    "{trouble}; job {job} goes on: with a token, rtfarm image {job} --coordinator \
+                     {coordinator} -o FILE fetches its picture"
+                ))));
+            }
             // The picture is not at fault: it stays where it is.
             (Stage::Fetching { job, .. }, Trouble::File(reason)) => {
                 let (job, coordinator) = (*job, &self.coordinator);
@@ -759,6 +776,22 @@ mod tests {
         bench.submission.on_stop(bench.now);
         bench.submission.on_cancelled();
         bench.check_failed(&["Cancel(JobId(7))"], 130, "interrupted");
+    }
+
+    #[test]
+    fn who_has_no_token_any_more_is_told_of_the_job_that_goes_on() {
+        let forbidden = || Trouble::Forbidden("the token is not known".to_owned());
+        let mut reconnecting = Bench::watching();
+        reconnecting.submission.on_trouble(Trouble::Gone, reconnecting.now);
+        for mut bench in [Bench::watching(), Bench::fetching(), reconnecting] {
+            bench.submission.on_trouble(forbidden(), bench.now);
+            let message = "the coordinator says: the token is not known; job 7 goes on: with a token, \
+                           rtfarm image 7 --coordinator http://host:1 -o FILE fetches its picture";
+            bench.check_failed(&[], 1, message);
+        }
+        let mut bench = Bench::submitting();
+        bench.submission.on_trouble(forbidden(), bench.now);
+        bench.check_failed(&[], 1, "the coordinator says: the token is not known");
     }
 
     #[test]
