@@ -619,9 +619,9 @@ pub(crate) struct SubmitArgs {
     #[arg(long, value_name = "NAME", help_heading = FARM)]
     pub(crate) name: Option<String>,
 
-    /// Who wants it; the user's login name by default, and whoever has a token of their own.
+    /// Who wants it; the user's login name by default. A token of an owner's own overrides it.
     #[arg(long, value_name = "OWNER", env = "RTFARM_OWNER", help_heading = FARM)]
-    pub(crate) owner: Option<String>,
+    pub(crate) owner: Option<Owner>,
 
     /// Submit only once under this key: the job of an earlier order of the same scene that has it is this one's.
     #[arg(long, value_name = "KEY", value_parser = NonEmptyStringValueParser::new(), help_heading = FARM)]

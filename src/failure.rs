@@ -1,6 +1,6 @@
 //! What went wrong, in one line, and the exit code that says so.
 
-use std::{fmt, process::ExitCode};
+use std::{borrow::Cow, fmt, process::ExitCode};
 
 use anyhow::anyhow;
 use rtfarm_client::{NoPicture, plain};
@@ -80,7 +80,17 @@ pub(crate) fn explain_usage(error: &clap::Error) -> ExitCode {
     let is_guess =
         |part: &str| part.trim_start().starts_with("tip: ") && part.contains(" similar ");
     let told = text.split("\n\n").enumerate().filter(|&(k, part)| k == 0 || is_guess(part));
-    let one_line = |(_, part): (_, &str)| part.split_whitespace().collect::<Vec<_>>().join(" ");
+    let one_line =
+        |(_, part): (_, &str)| part.split_whitespace().map(shorten).collect::<Vec<_>>().join(" ");
     Console::plain().tell(&told.map(one_line).collect::<Vec<_>>().join("; "));
     ExitCode::from(2)
+}
+
+/// A word as it can be told: the beginning of a long one.
+fn shorten(word: &str) -> Cow<'_, str> {
+    const LONGEST: usize = 200;
+    match word.char_indices().nth(LONGEST) {
+        Some((end, _)) => format!("{}...", &word[..end]).into(),
+        None => word.into(),
+    }
 }

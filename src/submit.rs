@@ -209,7 +209,7 @@ impl Here<'_> {
             crop: request.crop.map(Into::into),
             compact: request.form == Form::Compact,
             title: self.args.name.clone().unwrap_or_default(),
-            owner: self.args.owner.clone().unwrap_or_else(login_name),
+            owner: self.args.owner.as_ref().map_or_else(login_name, ToString::to_string),
             key: self.key.clone(),
             priority: self.args.priority,
             max_workers: self.args.max_workers.unwrap_or(0),

@@ -57,6 +57,12 @@ pub(crate) enum NoGraphics {
         "this terminal shows no pictures, neither by Kitty's or iTerm2's protocol nor by sixels"
     )]
     Unknown,
+    #[error(
+        "this terminal did not say that it shows pictures, by Kitty's or iTerm2's protocol or by sixels"
+    )]
+    Silent,
+    #[error("rtfarm is in the background")]
+    Background,
 }
 
 /// What a terminal shows pictures by.
@@ -83,7 +89,7 @@ impl Graphics {
         }
         match known(|name| env::var(name).ok()) {
             Some(known) => known,
-            None => ask(&stderr).await.unwrap_or(Err(NoGraphics::Unknown)),
+            None => ask(&stderr).await.unwrap_or(Err(NoGraphics::Silent)),
         }
     }
 
@@ -193,11 +199,11 @@ async fn ask(terminal: &io::Stderr) -> io::Result<Found> {
     let terminal = File::from(open(OsStr::from_bytes(name.as_bytes()), flags, Mode::empty())?);
     // Who is in the background would be stopped.
     if tcgetpgrp(&terminal).is_ok_and(|foreground| foreground != getpgrp()) {
-        return Ok(Err(NoGraphics::Unknown));
+        return Ok(Err(NoGraphics::Background));
     }
     let asked = Asked::open(terminal)?;
     rustix::io::write(&asked.terminal, QUESTION)?;
-    timeout(PATIENCE, asked.answer()).await.unwrap_or(Ok(Err(NoGraphics::Unknown)))
+    timeout(PATIENCE, asked.answer()).await.unwrap_or(Ok(Err(NoGraphics::Silent)))
 }
 
 /// A terminal that does not show what it answers, as long as this lives.
@@ -232,7 +238,7 @@ impl Asked {
                 return Ok(found);
             }
             if count == 0 {
-                return Ok(Err(NoGraphics::Unknown));
+                return Ok(Err(NoGraphics::Silent));
             }
         }
     }

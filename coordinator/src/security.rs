@@ -128,7 +128,7 @@ impl FromStr for Owner {
         if (1..=32).contains(&name.len()) && name.bytes().all(is_plain) {
             Ok(Self(name.to_owned()))
         } else {
-            Err(format!("`{name}` is no owner's name: 1 to 32 letters, digits, `-` and `_`"))
+            Err("it is no owner's name, which has 1 to 32 letters, digits, `-` and `_`".to_owned())
         }
     }
 }

@@ -13,15 +13,15 @@ use std::{
     },
 };
 
-/// What is ordered may be so much: by each owner of a token, and by all others together. Who looks after the farm, with a token to do everything, may order
-/// more.
+/// What is ordered may be so much: by each owner of a token, and by all others together. Who looks after
+/// the farm, with a token to do everything, may order more.
 #[derive(Debug, Clone, Copy)]
 pub struct OrderLimits {
     /// Jobs that have not ended.
     pub jobs: u64,
     /// Pixels of their pictures together.
     pub pixels: u64,
-    /// Bytes on disk of all jobs, those that have ended included.
+    /// Bytes on disk of all their jobs, those that have ended included.
     pub bytes: u64,
     /// Bytes of all scenes together that are being sent.
     pub upload_bytes: u64,
@@ -52,6 +52,19 @@ pub(crate) struct Ordered {
 impl OrderLimits {
     /// Says why an order cannot be taken on top of what there is; `None` when it can.
     pub(crate) fn refusal(&self, account: &str, there: Ordered, order: Ordered) -> Option<String> {
+        let gigabytes = |bytes: u64| bytes as f64 / 1e9;
+        // Nobody need wait for what will never be.
+        let too_large = if order.pixels > self.pixels {
+            Some(format!("{} pixels, and may have {}", order.pixels, self.pixels))
+        } else if order.bytes > self.bytes {
+            let [more, most] = [order.bytes, self.bytes].map(gigabytes);
+            Some(format!("{more:.2} GB on disk, and may have {most:.2} GB"))
+        } else {
+            None
+        };
+        if let Some(too_large) = too_large {
+            return Some(format!("it is too large for the farm: it has {too_large}"));
+        }
         let [jobs, pixels, bytes] = [
             (there.jobs, order.jobs, self.jobs),
             (there.pixels, order.pixels, self.pixels),
@@ -59,15 +72,18 @@ impl OrderLimits {
         ]
         .map(|(there, more, most)| there.saturating_add(more) > most);
         let over = if jobs {
-            format!("there are {} jobs already, and may be {}", there.jobs, self.jobs)
+            let there = match there.jobs {
+                1 => "is 1 job".to_owned(),
+                count => format!("are {count} jobs"),
+            };
+            format!("there {there} already, and may be {}", self.jobs)
         } else if pixels {
             format!(
                 "{} pixels more than the {} under way would be more than {}",
                 order.pixels, there.pixels, self.pixels
             )
         } else if bytes {
-            let [there, more, most] =
-                [there.bytes, order.bytes, self.bytes].map(|bytes| bytes as f64 / 1e9);
+            let [there, more, most] = [there.bytes, order.bytes, self.bytes].map(gigabytes);
             format!("{more:.2} GB more on disk than {there:.2} GB would be more than {most:.2} GB")
         } else {
             return None;
@@ -193,20 +209,27 @@ mod tests {
         let order = Ordered { jobs: 1, pixels: 40, bytes: 500_000_000 };
         assert_eq!(limits.refusal("", there, order), None);
         for (order, reason) in [
-            (Ordered { jobs: 2, ..order }, "there are 1 jobs already, and may be 2"),
+            (Ordered { jobs: 2, ..order }, "there is 1 job already, and may be 2"),
             (
                 Ordered { pixels: 41, ..order },
                 "41 pixels more than the 60 under way would be more than 100",
             ),
             (
-                Ordered { bytes: u64::MAX, ..order },
-                "GB more on disk than 0.50 GB would be more than 1.00 GB",
+                Ordered { bytes: 500_000_001, ..order },
+                "0.50 GB more on disk than 0.50 GB would be more than 1.00 GB",
             ),
         ] {
             let told = limits.refusal("", there, order).unwrap();
             assert!(told.contains(reason), "{told}");
             let told = limits.refusal("ada", there, order).unwrap();
             assert!(told.starts_with("the farm takes no more of ada for now: "), "{told}");
+        }
+        for (order, reason) in [
+            (Ordered { pixels: 101, ..order }, "it has 101 pixels, and may have 100"),
+            (Ordered { bytes: u64::MAX, ..order }, "GB on disk, and may have 1.00 GB"),
+        ] {
+            let told = limits.refusal("ada", Ordered::default(), order).unwrap();
+            assert!(told.contains(reason) && !told.contains("wait"), "{told}");
         }
     }
 }

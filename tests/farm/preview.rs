@@ -169,9 +169,10 @@ fn a_terminal_that_shows_sixels_shows_the_whole_picture_in_its_colours() {
 #[test]
 fn who_shows_no_pictures_is_told_of_in_one_line_and_gets_the_file() {
     let unknown = "there is no preview: this terminal shows no pictures";
-    for answer in ["\x1b[?1;2c", ""] {
+    let silent = "there is no preview: this terminal did not say that it shows pictures";
+    for (answer, reason) in [("\x1b[?1;2c", unknown), ("", silent)] {
         let (said, _) = Terminal::new(answer).render(&[], &["--workers", "0"]);
-        assert_eq!(said.matches(unknown).count(), 1, "{said:?}");
+        assert_eq!(said.matches(reason).count(), 1, "{said:?}");
         assert!(!said.contains("\x1b7"), "nothing is drawn: {said:?}");
     }
     let (said, _) = Terminal::new("").render(&[("TERM", "dumb")], &["--quiet"]);

@@ -62,12 +62,18 @@ fn orders_have_a_budget_which_the_token_of_those_who_look_after_the_farm_exceeds
         let words = ["submit", "scene.rt", "-o", "out.exr", "--detach", "--size", size];
         ask(&place, &[&words[..], &["--access", &access]].concat())
     };
-    for (size, reason) in [("200x100", "20000 pixels more than the 0"), ("64x64", "")] {
+    for (size, reason) in [("200x100", "it has 20000 pixels, and may have 10000"), ("64x64", "")] {
         let (code, said) = order("submit", size);
         assert_eq!((code == Some(0), said.contains(reason)), (reason.is_empty(), true), "{said}");
     }
     let (code, said) = order("submit", "8x8");
-    assert!(code == Some(2) && said.contains("there are 1 jobs already"), "{said}");
+    assert!(code == Some(2) && said.contains("there is 1 job already"), "{said}");
+    for (owner, shown) in [("", "''"), (&*"o".repeat(5000), "'oooo"), ("a b", "'a b'")] {
+        let words = ["submit", "scene.rt", "-o", "out.exr", "--access", "farm/access/submit"];
+        let (code, said) = ask(&place, &[&words[..], &["--owner", owner]].concat());
+        let is_told = said.contains(shown) && said.contains("no owner's name");
+        assert!(code == Some(2) && is_told && said.len() < 500, "{said}");
+    }
     assert_eq!(order("admin", "400x300").0, Some(0));
 }
 
@@ -99,7 +105,7 @@ fn an_owner_at_the_limit_stops_no_other_and_jobs_are_those_of_the_tokens_owner()
     };
     assert_eq!(order("submit.ada", &["--owner", "bo"]).0, Some(0));
     let (code, said) = order("submit.ada", &[]);
-    let reason = "the farm takes no more of ada for now: there are 1 jobs already, and may be 1";
+    let reason = "the farm takes no more of ada for now: there is 1 job already, and may be 1";
     assert!(code == Some(2) && said.contains(reason), "{said}");
     for holder in ["submit.bo", "submit"] {
         let (code, said) = order(holder, &["--owner", "ada"]);
