@@ -623,7 +623,7 @@ pub(crate) struct SubmitArgs {
     #[arg(long, value_name = "OWNER", env = "RTFARM_OWNER", help_heading = FARM)]
     pub(crate) owner: Option<Owner>,
 
-    /// Submit only once under this key: the job of an earlier order of the same scene that has it is this one's.
+    /// Submit only once under this key: the job that the same order has already is taken for this one.
     #[arg(long, value_name = "KEY", value_parser = NonEmptyStringValueParser::new(), help_heading = FARM)]
     pub(crate) key: Option<String>,
 
