@@ -231,10 +231,10 @@ fn the_page_shows_each_pixel_as_it_comes() {
     let mut coordinator = place.start("coordinator.log", &listen);
     let line = coordinator.read_line();
     let address = line.trim().strip_prefix("listening on ").unwrap().to_owned();
-    let hostile = "<img src=x onerror=alert(1)>\u{1b}[2J";
+    let hostile = "<b>me</b><img src=x onerror=alert(1)>\u{1b}[2J";
     let submit = ["submit", "scene.rt", "-o", "farm.png", "--detach", "--access"];
     let submit = [&submit[..], &["farm/access/submit"]].concat();
-    let more = ["--name", hostile, "--owner", "<b>me</b>", "--size", "200x150", "--samples", "64"];
+    let more = ["--name", hostile, "--size", "200x150", "--samples", "64"];
     let mut submit = place.start("submit.log", &[&submit[..], &more].concat());
     assert!(submit.wait().success(), "{}", submit.log());
     let job = submit.read_line().trim().to_owned();
