@@ -149,6 +149,8 @@ fn tell_speeds(triangles: usize, is_single: bool, form: Form) {
 fn count(class: usize) -> Option<(f64, f64)> {
     let count = |times: u32| {
         let output = Command::new("valgrind")
+            // Threads that wait while the scene is prepared count, and never the same.
+            .env("RAYON_NUM_THREADS", "1")
             .args(["--tool=callgrind", "--callgrind-out-file=/dev/null"])
             .arg(env::current_exe().expect("this program"))
             .args(["--only", &class.to_string(), &times.to_string()])
