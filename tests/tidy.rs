@@ -179,7 +179,7 @@ const ROOMS: [(&str, &[&str]); 13] = [
     ("light", &["exact", "prepared", "trace", "shade"]),
     ("render", &["exact", "prepared", "trace", "shade", "light"]),
     // A door for tests and benchmarks: nobody may import it.
-    ("testing", &["prepare", "prepared", "render", "trace"]),
+    ("testing", &["prepare", "render", "trace"]),
     ("lib", &[]),
 ];
 

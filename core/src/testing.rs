@@ -3,7 +3,6 @@
 pub use crate::{
     left_out::{BUILT_WITHOUT, FEATURES},
     prepare::prepare_with,
-    prepared::layout::SECTION_NAMES,
     render::trees::render_trees,
     trace::probe::{FaceTests, Probe, ProbeHit, Probing},
 };

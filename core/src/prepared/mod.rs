@@ -15,6 +15,8 @@ pub(crate) mod record;
 pub(crate) mod solid_tree;
 
 pub use bytes::{PreparedBytes, SceneHash};
+#[doc(hidden)]
+pub use layout::SECTION_NAMES;
 
 use self::layout::{BYTE_ORDER, HASHED_FROM, MAGIC, RECORD_SIZES, Sections, VERSION, View};
 

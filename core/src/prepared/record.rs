@@ -190,20 +190,19 @@ impl FaceRecord {
     /// The item at this place in the section `faces`.
     #[inline(always)]
     pub(crate) fn item(&self, place: usize) -> Item {
-        let kind = self.kind_and_rank & !Item::INDEX;
-        Item(
-            kind | if kind >> 29 <= Kind::Coplanar as u32 {
-                place as u32
-            } else {
-                self.vertices[0]
-            },
-        )
+        let index = if self.is_triangle() { place as u32 } else { self.vertices[0] };
+        Item(self.kind_and_rank & !Item::INDEX | index)
+    }
+
+    /// Whether it is a triangle, alone in its plane or not.
+    #[inline(always)]
+    fn is_triangle(&self) -> bool {
+        self.kind_and_rank >> 29 <= Kind::Coplanar as u32
     }
 
     /// The vertices of a triangle, to be changed; `None` for another item.
     pub(crate) fn triangle_vertices(&mut self) -> Option<&mut [u32; 3]> {
-        let is_triangle = self.kind_and_rank >> 29 <= Kind::Coplanar as u32;
-        is_triangle.then_some(&mut self.vertices)
+        self.is_triangle().then_some(&mut self.vertices)
     }
 
     /// The rank of a triangle.

@@ -10,7 +10,8 @@ use crate::prepared::{
 /// Children that may wait while a ray visits others: seven on each level and the last node's.
 pub(super) const STACK: usize = 7 * MOST_LEVELS + 8;
 
-/// Room for them and for a node, kept from ray to ray: to fill it anew for each would cost as much as the ray.
+/// Room for them and for a node, kept from ray to ray: to fill it anew for each would cost as much as
+/// the ray.
 #[derive(Debug)]
 pub(super) struct Stack([(f32, Child); STACK], Node);
 

@@ -8,10 +8,9 @@ use rayon::prelude::*;
 use rtfarm_core::{
     isa::Isa,
     prepare::prepare,
-    prepared::{PreparedBytes, PreparedError, PreparedScene},
+    prepared::{PreparedBytes, PreparedError, PreparedScene, SECTION_NAMES},
     render::{Quality, Sampling, Settings, render_tile},
     scene::{Scene, Texture},
-    testing::SECTION_NAMES,
     tile::Size,
 };
 

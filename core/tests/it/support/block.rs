@@ -2,7 +2,7 @@
 
 use std::ops::Range;
 
-use rtfarm_core::testing::SECTION_NAMES;
+use rtfarm_core::prepared::SECTION_NAMES;
 
 /// Where the table of sections begins, behind the hash of all that follows it.
 pub(crate) const TABLE: usize = 8 + 4 + 4 + 32;
