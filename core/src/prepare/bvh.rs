@@ -75,11 +75,6 @@ impl BuildPrimitive {
         Self(Bounds { min, max: Vec4::new(x, y, z, 0.0) })
     }
 
-    /// The least and the greatest corner of its box.
-    pub(super) fn corners(&self) -> [[f32; 3]; 2] {
-        [self.0.min, self.0.max].map(|corner| corner.truncate().to_array())
-    }
-
     pub(super) fn item(&self) -> u32 {
         self.0.min.w.to_bits()
     }

@@ -23,9 +23,8 @@ const GRAZED: f64 = 1.0 / (1 << 17) as f64;
 const STEEP: f64 = 1.0 / (1 << 24) as f64;
 
 /// Builds the hierarchy over a solid's leaves, one in each leaf of the hierarchy, at the end of
-/// `boxes`; a small solid has no more than the boxes of its leaves in file order. A leaf counts only within
-/// the bounds of every operation above it: what is taken away only where something is, for example; one
-/// that does not count anywhere is left out.
+/// `boxes`. A leaf counts only within the bounds of every operation above it: what is taken away
+/// only where something is, for example; one that does not count anywhere is left out.
 pub(super) fn enclose_leaves(
     solid: &mut SolidRecord,
     nodes: &[SolidNodeRecord],
@@ -63,21 +62,8 @@ pub(super) fn enclose_leaves(
             counts.then(|| BuildPrimitive::new(min, max, item))
         })
         .collect();
-    solid.first_box = boxes.len() as u32;
-    if solid.is_small() {
-        boxes.resize(boxes.len() + solid.first_boxes().len(), Node::EMPTY);
-        for primitive in &primitives {
-            let (leaf, [min, max]) = (primitive.item() as usize, primitive.corners());
-            let node = &mut boxes[solid.first_box as usize + leaf / 8];
-            for axis in 0..3 {
-                (node.planes[axis][leaf % 8], node.planes[axis + 3][leaf % 8]) =
-                    (min[axis], max[axis]);
-            }
-            node.children[leaf % 8] = Child::leaf(leaf, 1);
-        }
-        return;
-    }
     let built = build_bvh(&mut primitives, Leaves { most: 1, alone_from: 0 });
+    solid.first_box = boxes.len() as u32;
     boxes.extend(built.into_iter().map(|mut node| {
         node.children = node.children.map(|child| {
             if child.is_leaf() {

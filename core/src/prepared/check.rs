@@ -95,16 +95,7 @@ pub(super) fn check(view: &View<'_>) -> Result<(), &'static str> {
         let is_doubt = 0.0 < solid.most_doubt && solid.most_doubt <= solid.margin / 8.0;
         ensure(is_doubt, "a solid's margin")?;
     }
-    let roots = view
-        .solids
-        .iter()
-        .flat_map(|solid| solid.first_boxes().map(|index| (index, solid.leaves().len())));
-    for solid in view.solids.iter().filter(|solid| solid.is_small()) {
-        let nodes = view.solid_boxes.get(solid.first_boxes()).ok_or("no root")?;
-        let children = nodes.iter().flat_map(|node| node.children).enumerate();
-        let in_place = |(k, child)| child == Child::NONE || child == Child::leaf(k, 1);
-        ensure(children.into_iter().all(in_place), "a solid's leaf")?;
-    }
+    let roots = view.solids.iter().map(|solid| (solid.first_box as usize, solid.leaves().len()));
     check_hierarchies(view.solid_boxes.iter().copied(), roots)?;
     for light in view.lights {
         let is_finite = light.intensity.iter().all(|channel| channel.is_finite());

@@ -15,7 +15,7 @@ use super::{
 pub(super) const MAGIC: [u8; 8] = *b"rtfarm\r\n";
 
 /// The version changes with the layout or the meaning of any byte.
-pub(super) const VERSION: u32 = 11;
+pub(super) const VERSION: u32 = 10;
 
 /// This number reads differently on a machine of the other byte order.
 pub(super) const BYTE_ORDER: u32 = 0x0102_0304;

@@ -285,7 +285,7 @@ pub(crate) struct SolidRecord {
     node_count: u32,
     first_leaf: u32,
     leaf_count: u32,
-    /// Its boxes in the section `solid_boxes` begin here.
+    /// The root of its hierarchy in the section `solid_boxes`.
     pub(crate) first_box: u32,
     /// The rank of its first leaf's first face; each leaf has six.
     pub(super) rank: u32,
@@ -311,20 +311,6 @@ impl SolidRecord {
     /// The run of its nodes.
     pub(crate) fn nodes(&self) -> Range<usize> {
         self.first_node as usize..self.first_node as usize + self.node_count as usize
-    }
-
-    /// The nodes in the section `solid_boxes` that rays begin at: the root of its hierarchy, or all of its
-    /// boxes, eight leaves each in file order, where it has at most [`SolidNodeRecord::BITS`] nodes.
-    #[inline(always)]
-    pub(crate) fn first_boxes(&self) -> Range<usize> {
-        let first = self.first_box as usize;
-        first..first + if self.is_small() { self.leaf_count.div_ceil(8) as usize } else { 1 }
-    }
-
-    /// Whether each of its nodes has a bit.
-    #[inline(always)]
-    pub(crate) fn is_small(&self) -> bool {
-        self.node_count as usize <= SolidNodeRecord::BITS
     }
 
     /// The run of its leaves.

@@ -66,8 +66,6 @@ pub(super) struct Course<'a> {
     pub(super) near: Ray,
     /// The course starts here on the ray.
     pub(super) start: f64,
-    /// The place nearest to the middle of the solid.
-    middle: f64,
     /// The length of the vector to where it starts.
     size: f64,
 }
@@ -92,15 +90,8 @@ impl<'a> Course<'a> {
             ray,
             near: Ray { origin, reach: ray.reach - start, ..*ray },
             start,
-            middle: ahead - start,
             size: origin.length(),
         }
-    }
-
-    /// Where along the course the ray comes nearest to the middle of the solid.
-    #[inline(always)]
-    pub(super) fn middle(&self) -> f64 {
-        self.middle
     }
 
     /// How far rounding may move a crossing of a leaf along the ray, which meets it at a cosine; no

@@ -81,31 +81,25 @@ impl Scratch {
         };
         // What comes up to here was told, or does not count.
         let mut told = -course.start - margin;
-        if !solid.is_small() || !ending_on.is_empty() {
+        if course.nodes.len() > SolidNodeRecord::BITS || !ending_on.is_empty() {
             self.waiting.clear();
             self.touched.clear();
             if has_few {
                 self.touched.extend(0..leaf_count as u32);
             } else {
-                let first = solid.first_boxes().map(|node| (f32::NEG_INFINITY, Child::inner(node)));
-                self.waiting.extend(first);
+                self.waiting.push((f32::NEG_INFINITY, Child::inner(solid.first_box as usize)));
             }
             return self.join_in_looks(&course, kernel, &box_ray, (told, reach), &mut take);
         }
-        // Leaves that begin beyond the place nearest to the middle wait until the walk comes there.
-        let middle = course.middle();
-        let known = middle - 3.0 * margin;
-        let (touched, later) = if has_few {
-            ((1 << leaf_count) - 1, 0)
+        let touched = if has_few {
+            (1 << leaf_count) - 1
         } else {
-            touch_few_leaves(&course, kernel, &box_ray, (middle * solid.frame.scale) as f32)
+            touch_few_leaves(&course, kernel, &box_ray)
         };
         if touched == 0 {
             return;
         }
-        let leaves = if told < known { [touched & !later, later] } else { [touched, 0] };
-        let stretch = (&mut told, known, reach);
-        let walked = self.walk.tell(kernel, &course, leaves, stretch, &mut take);
+        let walked = self.walk.tell(kernel, &course, touched, (&mut told, reach), &mut take);
         if walked == Walked::Unsure {
             self.touched.clear();
             self.touched.extend((0..leaf_count as u32).filter(|leaf| touched >> leaf & 1 == 1));
@@ -427,27 +421,28 @@ impl Scratch {
     }
 }
 
-/// The leaves whose boxes the ray touches, a bit each, of a solid that has a bit for each node, and those
-/// of them whose boxes begin beyond `middle`, in their frame.
+/// The leaves whose boxes the ray touches, a bit each, of a solid of at most
+/// [`SolidNodeRecord::BITS`] nodes. Its hierarchy has fewer than that, too.
 #[inline(always)]
-fn touch_few_leaves(
-    course: &Course<'_>,
-    kernel: impl BoxKernel,
-    box_ray: &BoxRay,
-    middle: f32,
-) -> (u64, u64) {
-    let (mut touched, mut later) = (0, 0);
-    let nodes = &course.view.solid_boxes[course.solid.first_boxes()];
-    for (first, node) in (0..).step_by(8).zip(nodes) {
-        let (distances, mask) = kernel.test(node, box_ray);
-        touched |= u64::from(mask) << first;
-        let mut beyond = 0;
-        for (k, distance) in distances.iter().enumerate() {
-            beyond |= u32::from(*distance > middle) << k;
+fn touch_few_leaves(course: &Course<'_>, kernel: impl BoxKernel, box_ray: &BoxRay) -> u64 {
+    let bit = |index: usize| 1_u64.checked_shl(index as u32).unwrap_or(0);
+    let first = course.solid.first_box as usize;
+    let (mut touched, mut waiting) = (0, 1_u64);
+    while waiting != 0 {
+        let node = &course.view.solid_boxes[first + waiting.trailing_zeros() as usize];
+        waiting &= waiting - 1;
+        let (_, mut mask) = kernel.test(node, box_ray);
+        while mask != 0 {
+            let child = node.children[mask.trailing_zeros() as usize & 7];
+            mask &= mask - 1;
+            if child.is_leaf() {
+                touched |= bit(child.items().start);
+            } else {
+                waiting |= bit(child.node() - first);
+            }
         }
-        later |= u64::from(beyond & mask) << first;
     }
-    (touched, later)
+    touched
 }
 
 /// Sorts ends by where they begin. Few are many times faster sorted so; many are rare.

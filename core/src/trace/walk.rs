@@ -47,8 +47,7 @@ const MOST_LEAVES: usize = 32;
 /// Room for a walk.
 #[derive(Debug)]
 pub(super) struct Walk {
-    /// How many leaves are met.
-    count: usize,
+    /// The leaves that are met, in file order.
     leaves: [u8; MOST_LEAVES],
     /// Where the ray enters and where it leaves each of them, two leaves a row: infinite where that
     /// does not count, and once it is behind. They are not sorted: most walks end after a few steps.
@@ -61,49 +60,31 @@ pub(super) struct Walk {
 impl Default for Walk {
     fn default() -> Self {
         let ends = [[f64::INFINITY; 4]; MOST_LEAVES / 2];
-        Self { count: 0, leaves: [0; MOST_LEAVES], ends, inside: 0, changes: Vec::new() }
+        Self { leaves: [0; MOST_LEAVES], ends, inside: 0, changes: Vec::new() }
     }
 }
 
 impl Walk {
     /// Calls `take` for the crossings after `told` and up to `reach`, in order, until it says that it
-    /// has enough; `told` follows. The leaves that may count have a bit each, in a solid of at most
-    /// [`SolidNodeRecord::BITS`] nodes: those that may before `known` come first. It is not sure of more
-    /// than [`MOST_LEAVES`].
+    /// has enough; `told` follows. `touched` are the leaves that may count, a bit each, of a solid of
+    /// at most [`SolidNodeRecord::BITS`] nodes; it is not sure of more than [`MOST_LEAVES`].
     #[inline(always)]
     pub(super) fn tell(
         &mut self,
         kernel: impl BoxKernel,
         course: &Course<'_>,
-        [leaves, mut later]: [u64; 2],
-        (told, known, reach): (&mut f64, f64, f64),
+        touched: u64,
+        (told, reach): (&mut f64, f64),
         mut take: impl FnMut(Crossing) -> bool,
     ) -> Walked {
-        if (leaves | later).count_ones() as usize > MOST_LEAVES {
+        let Some(count) = self.collect(kernel, course, touched, [*told, reach]) else {
             return Walked::Unsure;
-        }
-        (self.inside, self.count) = (0, 0);
-        if self.collect(kernel, course, (leaves, &mut later), [*told, reach]).is_none() {
-            return Walked::Unsure;
-        }
+        };
+        let rows = count.div_ceil(2);
         let apart = course.apart();
-        let (_, mut t) = self.take_out(kernel, f64::NAN);
-        loop {
-            if later != 0 && t > known {
-                if known > reach {
-                    return Walked::Through;
-                }
-                *told = told.max(known);
-                let leaves = std::mem::take(&mut later);
-                if self.collect(kernel, course, (leaves, &mut later), [*told, reach]).is_none() {
-                    return Walked::Unsure;
-                }
-                t = self.take_out(kernel, f64::NAN).1;
-            }
-            if !(t <= reach && t < f64::INFINITY) {
-                return Walked::Through;
-            }
-            let (ends, next) = self.take_out(kernel, t);
+        let (_, mut t) = self.take_out(kernel, rows, f64::NAN);
+        while t <= reach && t < f64::INFINITY {
+            let (ends, next) = self.take_out(kernel, rows, t);
             if next - t <= apart {
                 return Walked::Unsure;
             }
@@ -128,12 +109,12 @@ impl Walk {
             *told = told.max(t);
             t = next;
         }
+        Walked::Through
     }
 
     /// Takes the ends at `t` out: a bit for each of them, and the first of the others.
     #[inline(always)]
-    fn take_out(&mut self, kernel: impl BoxKernel, t: f64) -> (u64, f64) {
-        let rows = self.count.div_ceil(2);
+    fn take_out(&mut self, kernel: impl BoxKernel, rows: usize, t: f64) -> (u64, f64) {
         let mut least = [f64::INFINITY; 4];
         let mut taken = 0;
         for (row, ends) in self.ends[..rows].iter_mut().enumerate() {
@@ -152,28 +133,31 @@ impl Walk {
         Event { leaf, enters: end.is_multiple_of(2) }
     }
 
-    /// Meets more leaves and finds what the ray is inside at the beginning; `later` loses those that make
-    /// no difference any more. `None` if a leaf's stretch is not sure.
+    /// Meets the leaves and finds what the ray is inside at the beginning; how many there are.
+    /// `None` if a leaf's stretch is not sure.
     #[inline(always)]
     fn collect(
         &mut self,
         kernel: impl BoxKernel,
         course: &Course<'_>,
-        (mut touched, later): (u64, &mut u64),
+        mut touched: u64,
         [told, reach]: [f64; 2],
-    ) -> Option<()> {
+    ) -> Option<usize> {
+        if touched.count_ones() as usize > MOST_LEAVES {
+            return None;
+        }
         let (from, to) = (told - course.solid.margin, reach + course.solid.margin);
-        let mut count = self.count;
+        self.inside = 0;
+        let mut count = 0;
         while touched != 0 {
             let number = touched.trailing_zeros();
             touched &= touched - 1;
             let leaf = &course.leaves[number as usize];
             let [enter, leave] = course.sure_stretch(kernel, leaf)?;
             if enter > to || leave < from {
-                // The leaves up to the rest make no difference any more.
-                let rest = u64::MAX.checked_shl(course.nodes[leaf.node as usize].rest).unwrap_or(0);
-                touched &= rest;
-                *later &= rest | !(u64::MAX << number);
+                // The leaves before the rest make no difference any more.
+                let rest = course.nodes[leaf.node as usize].rest;
+                touched &= u64::MAX.checked_shl(rest).unwrap_or(0);
                 continue;
             }
             let mut ends = [f64::INFINITY; 2];
@@ -193,8 +177,7 @@ impl Walk {
         if count % 2 == 1 {
             self.ends[count / 2][2..].fill(f64::INFINITY);
         }
-        self.count = count;
-        Some(())
+        Some(count)
     }
 
     /// Enters or leaves a node, and those above that change with it: the last of them.
