@@ -1,6 +1,6 @@
 //! A pixel on its way: the sums of its samples, and how far off their mean may be.
 
-use glam::{BVec3, DVec3};
+use glam::{BVec3, DVec3, FloatExt};
 
 use crate::{
     sample::{FEWEST_FOR_ERROR, RUNS},
@@ -167,6 +167,10 @@ pub(super) struct Pixel {
     contrast: DVec3,
     /// The variance that faces add which no sample has met.
     unseen: DVec3,
+    /// What such faces add in the decision to stop.
+    feared: DVec3,
+    /// The share of the pixel, 0..=1, of those that later samples met.
+    passed_share: f64,
     /// The noise of the pixels beside it, where that is alike.
     noise: Option<Noise>,
 }
@@ -230,6 +234,50 @@ pub(super) struct Wanted {
     pub(super) full_light: f64,
 }
 
+/// What covers less of a pixel is thin: few samples meet it, by chance more or less.
+const THIN_SHARE: f64 = 1.0 / 4.0;
+
+/// A thing that covers a small share of a pixel may have so many times the variance of one sample that
+/// is expected of it, where samples happened to meet it too often.
+const THIN: f64 = 3.0;
+
+/// As long as it is more probable than this that all samples miss a thing, what the mean lacks without it
+/// counts [`FEAR`] times.
+const MOST_MISSED: f64 = 1.0 / 7.0;
+const FEAR: f64 = 4.0;
+
+/// How probable it is that so many samples miss what covers this share of their pixel, 0..=1.
+pub(super) fn missed(share: f64, count: u32) -> f64 {
+    power(1.0 - share, count)
+}
+
+/// Raises `base` to a whole power by squaring.
+fn power(base: f64, exponent: u32) -> f64 {
+    let (mut product, mut square, mut left) = (1.0, base, exponent);
+    while left > 0 {
+        if left & 1 == 1 {
+            product *= square;
+        }
+        square *= square;
+        left >>= 1;
+    }
+    product
+}
+
+/// The variance that something adds in the decision to stop, whether samples met it or not: where pixels
+/// in which they did go on and others stop, light is lacking. It covers this share of the pixel, and the
+/// mean lacks so much if no sample meets it.
+pub(super) fn feared(share: f64, lack: DVec3, count: u32) -> DVec3 {
+    let (n, missed) = (f64::from(count), missed(share, count));
+    let expected = (EDGE / (n * n.sqrt())).lerp(1.0 / n, DECISION_OF_RUNS) * (1.0 - share) / share;
+    let feared = match share {
+        ..THIN_SHARE if missed > MOST_MISSED => FEAR,
+        ..THIN_SHARE => expected.max(missed).min(FEAR),
+        _ => missed,
+    };
+    lack * lack * feared
+}
+
 /// What a pixel shows of a contrast that runs evenly through its neighbourhood, as of a shade: a
 /// fourth. What is beyond that is unseen.
 const EVEN: f64 = 4.0;
@@ -246,6 +294,8 @@ impl Pixel {
             around,
             contrast: around.contrast,
             unseen: DVec3::ZERO,
+            feared: DVec3::ZERO,
+            passed_share: 0.0,
             noise: None,
         }
     }
@@ -295,9 +345,10 @@ impl Pixel {
         self.contrast = high - low;
     }
 
-    /// Notes the variance that faces add to the mean which no sample has met.
-    pub(super) fn set_unseen(&mut self, variance: DVec3) {
-        self.unseen = variance;
+    /// Notes what faces that the first sample missed add to the variance of the mean, and in the decision
+    /// to stop, and the share of the pixel, 0..=1, of those that later samples met.
+    pub(super) fn set_unseen(&mut self, variance: DVec3, feared: DVec3, passed_share: f64) {
+        (self.unseen, self.feared, self.passed_share) = (variance, feared, passed_share);
     }
 
     /// The mean of all samples and its variance. Of one sample the neighbourhood's first ones tell
@@ -324,13 +375,17 @@ impl Pixel {
 
     /// Whether the standard error is expected to be small enough in each channel: nearly that of
     /// an edge with the same samples, but runs that lie far apart keep the pixel open. In a common
-    /// noise the neighbours' samples tell both.
+    /// noise the neighbours' samples tell both, of thin things their share of the pixel.
     pub(super) fn is_done(&self, wanted: &Wanted) -> bool {
         let n = f64::from(self.runs.count);
+        let contrast = self.range[1] - self.range[0];
+        let of_thin = contrast * contrast * (self.passed_share * (1.0 - self.passed_share));
+        let of_one = self.variance_of_one();
         let of_samples = if self.runs.count == 1 {
             self.around.variance
+        } else if self.is_thin() && of_one.cmple(THIN * of_thin).all() {
+            Some(DVec3::ZERO)
         } else {
-            let of_one = self.variance_of_one();
             let noise = self.noise.filter(|noise| of_one.cmple(ALIKE * noise.of_one).all());
             let (of_one, of_runs) = match noise {
                 Some(Noise { of_one, of_round }) => {
@@ -343,9 +398,15 @@ impl Pixel {
             of_runs.map(|of_runs| of_edge.lerp(of_runs, DECISION_OF_RUNS))
         };
         of_samples.is_some_and(|variance| {
-            let variance = variance + self.missed_variance() + self.unseen;
+            let passed = feared(self.passed_share, self.passed_share * contrast, self.runs.count);
+            let variance = variance + self.missed_variance() + self.feared + passed;
             self.unclipped(variance, wanted).max_element() < wanted.error * wanted.error
         })
+    }
+
+    /// Whether the faces that the first sample missed and later ones met are thin.
+    fn is_thin(&self) -> bool {
+        self.passed_share > 0.0 && self.passed_share < THIN_SHARE
     }
 
     /// The variance of one sample, channel by channel, from how far several lie apart.
@@ -416,6 +477,13 @@ mod tests {
 
     fn wanted(error: f64) -> Wanted {
         Wanted { error, full_light: f64::INFINITY }
+    }
+
+    #[test]
+    fn a_power_is_a_product() {
+        assert_eq!(power(0.5, 0), 1.0);
+        assert_eq!(power(0.5, 13), 1.0 / 8192.0);
+        assert_eq!(power(0.0, 8), 0.0);
     }
 
     #[test]

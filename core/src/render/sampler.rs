@@ -295,7 +295,8 @@ impl OpenPixel {
             let places = (first..count).map(|number| samples.sample(number).place(x, y));
             search.note_samples(unseen, places, count);
         }
-        self.pixel.set_unseen(unseen.variance(count));
+        let (variance, feared) = (unseen.variance(count), unseen.feared_variance(count));
+        self.pixel.set_unseen(variance, feared, unseen.passed_share());
     }
 }
 

@@ -333,7 +333,7 @@ impl<'a> Judge<'a> {
     fn drop_negligible(&self, unseen: &mut UnseenFaces, count: u32) {
         let lack = NEGLIGIBLE_SUM * self.error;
         if unseen.variance(count).max_element() < lack * lack {
-            *unseen = UnseenFaces::default();
+            unseen.forget_unseen();
         }
     }
 }
