@@ -212,8 +212,8 @@ class Bench:
 
     def equal(self):
         """To a root mean square error of one step of 8 bits, both pictures in 8 bits."""
-        print('| 1280 x 720 | Mitsuba: samples, error; wall, processor s | rtfarm: `--error`, error; wall, processor s '
-              '| Mitsuba / rtfarm |\n|---|---|---|---|')
+        print('| 1280 x 720 | Mitsuba: samples, error; wall, processor s | rtfarm: samples, error; wall, processor s '
+              '| Mitsuba / rtfarm | `--error`, error; wall, processor s | Mitsuba / rtfarm |\n|---|---|---|---|---|---|')
         path = {program: self.picture(program, 'mesh') for program in ('mitsuba', 'rtfarm')}
 
         def first_within(program, truth, ladder, command):
@@ -228,17 +228,19 @@ class Bench:
             source = self.generated(scene)
             run(self.mitsuba(source, 1024, 'multijitter'))
             truth = read_png(path['mitsuba'])
-            counts = [math.ceil(2 ** (k / 2)) ** 2 for k in range(11)]
-            samples, missed, peer = first_within(
-                'mitsuba', truth, counts, lambda n: self.mitsuba(source, n, 'multijitter'))
+            squares = [1, 4, 9, 16, 25, 36, 64, 100, 144, 256, 400, 576]
+            found = [first_within('mitsuba', truth, squares, lambda n: self.mitsuba(source, n, 'multijitter'))]
             run(self.whole(source, '--samples 1024'))
             truth = read_png(path['rtfarm'])
-            level, own_missed, own = first_within(
-                'rtfarm', truth, ERRORS, lambda level: self.whole(source, f'--error {level}'))
-            times = self.medians([peer, own])
-            print(f'| {name} | {samples}, {missed:.2f}; {times[0][0]:.2f}, {times[0][1]:.2f} '
-                  f'| {255 * float(level):.2g}/255, {own_missed:.2f}; {times[1][0]:.2f}, {times[1][1]:.2f} '
-                  f'| {times[0][0] / times[1][0]:.2f}, {times[0][1] / times[1][1]:.2f} |', flush=True)
+            counts = [1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 128, 256]
+            found += [first_within('rtfarm', truth, counts, lambda n: self.whole(source, f'--samples {n}')),
+                      first_within('rtfarm', truth, ERRORS, lambda level: self.whole(source, f'--error {level}'))]
+            times = self.medians([command for _, _, command in found])
+            steps = [str(step) for step, _, _ in found[:2]] + [f'{255 * float(found[2][0]):.2g}/255']
+            cells = [f'{step}, {missed:.2f}; {wall:.2f}, {processor:.2f}'
+                     for step, (_, missed, _), (wall, processor) in zip(steps, found, times)]
+            ratios = [f'{times[0][0] / wall:.2f}, {times[0][1] / processor:.2f}' for wall, processor in times[1:]]
+            print(f'| {name} | {cells[0]} | {cells[1]} | {ratios[0]} | {cells[2]} | {ratios[1]} |', flush=True)
         print()
 
     def same_samples(self):
