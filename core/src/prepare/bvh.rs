@@ -315,7 +315,7 @@ fn build_node(range: BuildRange<'_>, level: usize, nodes: &mut Vec<Node>) {
             Ok(subtree) => {
                 let offset = nodes.len();
                 nodes[own].children[k] = Child::inner(offset);
-                nodes.extend(subtree.into_iter().map(|mut node| {
+                nodes.par_extend(subtree.into_par_iter().with_min_len(SERIAL).map(|mut node| {
                     node.children = node.children.map(|child| child.moved_by(offset));
                     node
                 }));
