@@ -38,6 +38,20 @@ impl PreparedBytes {
         Self { lines, length: bytes.len() }
     }
 
+    /// Bytes that `read` puts into places, of which it is told where among all `length` they begin; it is
+    /// called on rayon's threads.
+    pub fn read<E: Send>(
+        length: usize,
+        read: impl Fn(&mut [u8], usize) -> Result<(), E> + Sync,
+    ) -> Result<Self, E> {
+        let empty = (0..length.div_ceil(64)).into_par_iter().with_min_len(COPIED_AT_ONCE);
+        let mut block = Self { lines: empty.map(|_| Line([0; 64])).collect(), length };
+        let piece = 64 * COPIED_AT_ONCE;
+        let pieces = block.bytes_mut().par_chunks_mut(piece).enumerate();
+        pieces.try_for_each(|(k, place)| read(place, k * piece))?;
+        Ok(block)
+    }
+
     /// The scene's address.
     pub fn hash(&self) -> SceneHash {
         let header: &Header = bytemuck::from_bytes(&self.as_ref()[..size_of::<Header>()]);
