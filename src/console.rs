@@ -1,12 +1,11 @@
-//! Standard error: log lines, the progress bar and a picture above it, which share it.
+//! Standard error: log lines, the progress bar and a picture above it, which share it. Nobody here waits
+//! for who reads it.
 
 use std::{
     io::{self, IsTerminal, Write},
-    sync::{Arc, Mutex},
     time::Duration,
 };
 
-use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use rtfarm_client::plain;
 use rtfarm_core::language::Style;
 use rtfarm_job::Progress;
@@ -21,43 +20,25 @@ use tracing_subscriber::{
 
 use crate::{
     args::{Args, Command, LogFormat},
-    log_queue::LogQueue,
-    terminal::Drawing,
+    console_queue::ConsoleQueue,
+    footer::Footer,
+    terminal,
 };
 
 /// Standard error. Clones are the same one.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Console {
-    /// Set while a bar is on the screen; lines are then written above it.
-    bar: Arc<Mutex<Option<ProgressBar>>>,
-    /// The picture that stands above the bar, at the end of all that is on the screen. It is locked while
-    /// something is written.
-    picture: Arc<Mutex<Option<Shown>>>,
     wants_bar: bool,
     is_quiet: bool,
-    /// Where lines wait to be written; without it they are written at once.
-    lines: Option<LogQueue>,
-}
-
-/// A picture on the screen.
-#[derive(Debug)]
-struct Shown {
-    /// Rows that it takes.
-    rows: u16,
-    /// Takes it away where clearing its rows does not.
-    erase: String,
-}
-
-impl Shown {
-    /// Moves to its first row and clears it, and all below.
-    fn clear(self) -> String {
-        let Self { rows, erase } = self;
-        format!("\r\x1b[{rows}A{erase}\x1b[J")
-    }
+    /// Where what is said waits to be written; without it it is written at once.
+    queue: Option<ConsoleQueue>,
 }
 
 /// The longest that a process that ends waits for what it said to be read.
 const FAREWELL: Duration = Duration::from_secs(1);
+
+/// Characters of the bar itself.
+const BAR_WIDTH: usize = 40;
 
 impl Console {
     /// Standard error without logs and bars.
@@ -75,7 +56,8 @@ impl Console {
                 && format == LogFormat::Text
                 && !is_quiet
                 && !is_verbose
-                && io::stderr().is_terminal();
+                && io::stderr().is_terminal()
+                && std::env::var_os("TERM").is_none_or(|term| term != "dumb");
         let is_local_worker = matches!(command, Command::Worker(args) if args.parent.is_some());
         let level = if has_bar || is_local_worker || *is_quiet {
             LevelFilter::WARN
@@ -84,8 +66,6 @@ impl Console {
         } else {
             LevelFilter::INFO
         };
-        let bar = Arc::<Mutex<Option<ProgressBar>>>::default();
-        let picture = Arc::<Mutex<Option<Shown>>>::default();
         let describe = match format {
             LogFormat::Text => {
                 |count| format!(" WARN {count} lines were dropped: nobody read them\n")
@@ -95,12 +75,13 @@ impl Console {
                 format!("{}\n", json!({ "level": "WARN", "message": message, "lines": count }))
             },
         };
-        let lines = LogQueue::start(describe, {
-            let (bar, picture) = (Arc::clone(&bar), Arc::clone(&picture));
-            move |line| write_above(&bar, &picture, io::stderr(), line)
+        let mut footer = Footer::default();
+        let queue = ConsoleQueue::start(describe, move |batch| {
+            // There is nobody to tell when standard error fails.
+            let _ = footer.write(batch, terminal::columns() - 1, io::stderr(), io::stdout());
         });
         let (wants_bar, is_quiet) = (has_bar, *is_quiet);
-        let console = Self { bar, picture, wants_bar, is_quiet, lines: Some(lines) };
+        let console = Self { wants_bar, is_quiet, queue: Some(queue) };
         let filter = filter(std::env::var("RUST_LOG").ok().as_deref(), level);
         let lines = tracing_subscriber::fmt()
             .with_max_level(LevelFilter::TRACE)
@@ -123,51 +104,25 @@ impl Console {
         let _ = writeln!(self.make_writer(), "{line}");
     }
 
-    /// Writes a line to standard output, which may be the same terminal.
+    /// Writes a line to standard output; where that is a terminal, which may be the same one, in its turn.
     pub(crate) fn answer(&self, line: &str) -> io::Result<()> {
         let mut out = io::stdout();
-        if out.is_terminal() {
-            write_above(&self.bar, &self.picture, out, format!("{line}\n").as_bytes());
-            return Ok(());
+        match &self.queue {
+            Some(queue) if out.is_terminal() => queue.answer(format!("{line}\n").into_bytes()),
+            _ => writeln!(out, "{line}")?,
         }
-        writeln!(out, "{line}")
+        Ok(())
     }
 
-    /// Draws a picture above the bar, in place of the one that is there.
-    pub(crate) fn draw(&self, drawing: Drawing) {
-        let Drawing { bytes, rows, erase } = drawing;
-        above(&self.bar, || {
-            let mut picture = self.picture.lock().expect("drawing never panics");
-            let mut drawn = match picture.take() {
-                // The new one covers it.
-                Some(old) if old.rows == rows => format!("\r\x1b[{rows}A"),
-                old => old.map(Shown::clear).unwrap_or_default(),
-            };
-            // Its rows come into view first, so that nothing is moved while it is drawn.
-            drawn += &"\n".repeat(rows.into());
-            let start = format!("\x1b[{rows}A\x1b7");
-            let end = format!("\x1b8\x1b[{rows}B\r");
-            let drawn = [drawn.as_bytes(), start.as_bytes(), &bytes, end.as_bytes()].concat();
-            // There is nobody to tell when standard error fails.
-            let _ = io::stderr().write_all(&drawn);
-            *picture = Some(Shown { rows, erase });
-        });
-    }
-
-    /// Whether a picture stands above the bar.
-    pub(crate) fn has_picture(&self) -> bool {
-        self.picture.lock().expect("drawing never panics").is_some()
-    }
-
-    /// Lets the picture stand where it is: what comes next is written below it.
-    pub(crate) fn leave_picture(&self) {
-        *self.picture.lock().expect("drawing never panics") = None;
+    /// Where pictures and bars go; there are none on a plain console.
+    pub(crate) fn queue(&self) -> Option<&ConsoleQueue> {
+        self.queue.as_ref()
     }
 
     /// Waits until all that was said is written, but not for ever.
     pub(crate) fn close(&self) {
-        if let Some(lines) = &self.lines {
-            lines.flush(FAREWELL);
+        if let Some(queue) = &self.queue {
+            queue.flush(FAREWELL);
         }
     }
 
@@ -188,60 +143,49 @@ impl Console {
 
     /// Shows a bar for a picture of so many tiles, if bars are shown at all.
     pub(crate) fn start_bar(&self, tile_count: u32) -> Bar {
-        let bar = self.wants_bar.then(|| {
-            let style = ProgressStyle::with_template("{bar:40} {pos}/{len} tiles  {msg}");
-            let bar = ProgressBar::with_draw_target(
-                Some(tile_count.into()),
-                ProgressDrawTarget::stderr_with_hz(10),
-            )
-            .with_style(style.unwrap_or_else(|_| ProgressStyle::default_bar()));
-            bar.enable_steady_tick(Duration::from_millis(200));
-            *self.lock() = Some(bar.clone());
-            bar
-        });
-        Bar { drawn: bar, console: self.clone(), start: Instant::now() }
-    }
-
-    fn lock(&self) -> std::sync::MutexGuard<'_, Option<ProgressBar>> {
-        self.bar.lock().expect("drawing never panics")
+        let queue = self.queue.clone().filter(|_| self.wants_bar);
+        let bar = Bar { queue, start: Instant::now() };
+        bar.show(&Progress { tile_count, ..Progress::default() });
+        bar
     }
 }
 
 /// A progress bar; it goes when this does.
 #[derive(Debug)]
 pub(crate) struct Bar {
-    drawn: Option<ProgressBar>,
-    console: Console,
+    /// Where it is shown, if it is.
+    queue: Option<ConsoleQueue>,
     start: Instant,
 }
 
 impl Bar {
     /// Draws how far a job is.
     pub(crate) fn show(&self, progress: &Progress) {
-        let Some(bar) = &self.drawn else { return };
-        bar.set_position(progress.tiles_done.into());
-        if progress.tiles_done > 0 {
+        let Some(queue) = &self.queue else { return };
+        let Progress { tiles_done, tile_count, .. } = *progress;
+        let filled = BAR_WIDTH * tiles_done as usize / tile_count.max(1) as usize;
+        let (filled, empty) = ("█".repeat(filled), "░".repeat(BAR_WIDTH - filled));
+        let mut text = format!("{filled}{empty} {tiles_done}/{tile_count} tiles");
+        if tiles_done > 0 {
             let seconds = self.start.elapsed().as_secs_f64();
-            let tiles_left = f64::from(progress.tile_count - progress.tiles_done);
+            let tiles_left = f64::from(tile_count - tiles_done);
             let left = match progress.left {
                 Some(left) => {
                     let [mean, error] = [left.mean, left.error].map(|time| time.as_secs_f64());
                     format!("{mean:.0} ± {error:.0}")
                 }
-                None => format!("{:.0}", seconds / f64::from(progress.tiles_done) * tiles_left),
+                None => format!("{:.0}", seconds / f64::from(tiles_done) * tiles_left),
             };
             let mrays = progress.tally.rays as f64 / 1e6 / seconds;
-            bar.set_message(format!("{mrays:.1} Mrays/s  {left} s left"));
+            text += &format!("  {mrays:.1} Mrays/s  {left} s left");
         }
+        queue.show_bar(Some(text));
     }
 }
 
 impl Drop for Bar {
     fn drop(&mut self) {
-        if let Some(bar) = &self.drawn {
-            bar.finish_and_clear();
-            *self.console.lock() = None;
-        }
+        self.queue.iter().for_each(|queue| queue.show_bar(None));
     }
 }
 
@@ -251,32 +195,6 @@ impl<'a> MakeWriter<'a> for Console {
     fn make_writer(&'a self) -> LineWriter {
         LineWriter { console: self.clone(), line: Vec::new(), is_drawn: false }
     }
-}
-
-/// Does something while the bar, if there is one, is not on the screen.
-fn above(bar: &Mutex<Option<ProgressBar>>, act: impl FnOnce()) {
-    // Its clone, so that nobody waits for the bar while something is written.
-    let bar = bar.lock().expect("drawing never panics").clone();
-    match bar {
-        Some(bar) => bar.suspend(act),
-        None => act(),
-    }
-}
-
-/// Writes a line above the bar and in place of the picture, which is drawn again later.
-fn write_above(
-    bar: &Mutex<Option<ProgressBar>>,
-    picture: &Mutex<Option<Shown>>,
-    mut out: impl Write,
-    line: &[u8],
-) {
-    above(bar, || {
-        let mut picture = picture.lock().expect("drawing never panics");
-        let mut bytes = picture.take().map(Shown::clear).unwrap_or_default().into_bytes();
-        bytes.extend_from_slice(line);
-        // There is nobody to tell when it fails.
-        let _ = out.write_all(&bytes);
-    });
 }
 
 /// Collects a line and hands it on in one piece, so that lines of several processes do not mix.
@@ -306,9 +224,10 @@ impl Drop for LineWriter {
         if !self.is_drawn && !line.iter().all(is_plain) {
             line = plain(&String::from_utf8_lossy(&line)).into_bytes();
         }
-        match &self.console.lines {
-            Some(lines) => lines.push(&line),
-            None => write_above(&self.console.bar, &self.console.picture, io::stderr(), &line),
+        match &self.console.queue {
+            Some(queue) => queue.push(line),
+            // There is nobody to tell when it fails.
+            None => drop(io::stderr().write_all(&line)),
         }
     }
 }

@@ -25,6 +25,7 @@ use tokio_util::sync::CancellationToken;
 use crate::{
     BUILD, VERSION,
     args::{CertsArgs, CoordinatorArgs, TokenChange, TokensArgs},
+    console::Console,
     failure::Failure,
     output::folder_of,
     private_folder::PrivateFolder,
@@ -35,6 +36,7 @@ pub(crate) const UPLOAD_SILENCE: Duration = Duration::from_secs(30);
 
 pub(crate) async fn run(
     args: CoordinatorArgs,
+    console: &Console,
     stop: &CancellationToken,
     terminate: &CancellationToken,
 ) -> Result<(), Failure> {
@@ -47,7 +49,8 @@ pub(crate) async fn run(
     let folder = private.as_ref().map(PrivateFolder::path).or(args.state.as_deref());
     let folder = folder.expect("one of them is there").to_owned();
     let (listener, address) = place.listen(&args)?;
-    writeln!(io::stdout().lock(), "listening on {address}")
+    console
+        .answer(&format!("listening on {address}"))
         .context("cannot write to standard output")?;
 
     let config = Config {

@@ -5,12 +5,13 @@ mod cache;
 mod check;
 mod children;
 mod console;
+mod console_queue;
 mod coordinator;
 mod failure;
+mod footer;
 mod frames;
 mod image;
 mod local;
-mod log_queue;
 mod manual;
 mod memory;
 mod output;
@@ -87,7 +88,7 @@ async fn run(command: Command, console: &Console) -> Result<(), Failure> {
     let Signals { stop, terminate } = Signals::listen()?;
     match command {
         Command::Render(args) => render::run(args, console, &stop).await,
-        Command::Coordinator(args) => coordinator::run(args, &stop, &terminate).await,
+        Command::Coordinator(args) => coordinator::run(args, console, &stop, &terminate).await,
         Command::Worker(args) => worker::run(args, &stop, &terminate).await,
         Command::Submit(args) => submit::run(args, console, &stop).await,
         Command::Image(args) => image::run(args, &stop).await,

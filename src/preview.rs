@@ -13,17 +13,14 @@ use rtfarm_core::tile::Area;
 use rtfarm_picture::View;
 use tokio::{
     task::{JoinHandle, spawn_blocking},
-    time::{sleep, timeout},
+    time::sleep,
 };
 use tokio_util::sync::CancellationToken;
 
-use crate::{console::Console, failure::Failure, terminal::Graphics};
+use crate::{console::Console, console_queue::ConsoleQueue, failure::Failure, terminal::Graphics};
 
 /// The picture is drawn so often, if there is more to see.
 const PERIOD: Duration = Duration::from_millis(500);
-
-/// The longest that a picture which is ready waits for a terminal.
-const PATIENCE: Duration = Duration::from_secs(1);
 
 /// What a view shows of a picture now: `[y][x]`, red, green and blue.
 type Look = Arc<dyn Fn(View) -> io::Result<Vec<u8>> + Send + Sync>;
@@ -32,7 +29,7 @@ type Look = Arc<dyn Fn(View) -> io::Result<Vec<u8>> + Send + Sync>;
 #[derive(Debug)]
 pub(crate) struct Screen {
     graphics: Graphics,
-    console: Console,
+    queue: ConsoleQueue,
     /// Pictures that it has shown.
     count: AtomicU32,
 }
@@ -46,8 +43,8 @@ impl Screen {
         let found = stop.run_until_cancelled(Graphics::detect()).await;
         match found.ok_or(Failure::Interrupted)? {
             Ok(graphics) => {
-                let console = console.clone();
-                Ok(Some(Self { graphics, console, count: AtomicU32::new(0) }))
+                let queue = console.queue().cloned();
+                Ok(queue.map(|queue| Self { graphics, queue, count: AtomicU32::new(0) }))
             }
             Err(reason) => {
                 tracing::warn!("there is no preview: {reason}");
@@ -65,7 +62,7 @@ impl Screen {
         let number = self.count.fetch_add(1, Ordering::Relaxed) % 1024;
         let painter = Painter {
             graphics: self.graphics,
-            console: self.console.clone(),
+            queue: self.queue.clone(),
             window,
             look: Arc::new(look),
             // No other picture in the terminal has it, as long as processes' numbers differ.
@@ -87,8 +84,7 @@ impl Preview {
     /// Draws the picture as it is for the last time; it stays.
     pub(crate) async fn end(mut self) {
         self.stop.cancel();
-        // Who does not read is not waited for.
-        let _ = timeout(PATIENCE, &mut self.drawing).await;
+        (&mut self.drawing).await.expect("nothing here panics");
     }
 }
 
@@ -101,7 +97,7 @@ impl Drop for Preview {
 #[derive(Clone)]
 struct Painter {
     graphics: Graphics,
-    console: Console,
+    queue: ConsoleQueue,
     window: Area,
     look: Look,
     id: u32,
@@ -115,6 +111,10 @@ impl Painter {
                 () = stop.cancelled() => true,
                 () = sleep(PERIOD) => false,
             };
+            // A terminal that takes nothing gets the last picture, if it takes more again.
+            if self.queue.is_drawing() && !is_last {
+                continue;
+            }
             let painter = self.clone();
             let painting = spawn_blocking(move || painter.paint_once(&seen));
             match painting.await.expect("nothing here panics") {
@@ -122,7 +122,7 @@ impl Painter {
                 Err(error) => return tracing::warn!(reason = %error, "there is no more preview"),
             }
             if is_last {
-                self.console.leave_picture();
+                self.queue.leave_picture();
                 return;
             }
         }
@@ -132,8 +132,8 @@ impl Painter {
     fn paint_once(&self, seen: &[u8]) -> io::Result<Vec<u8>> {
         let view = Graphics::view(self.window);
         let pixels = (self.look)(view)?;
-        if pixels != seen || !self.console.has_picture() {
-            self.console.draw(self.graphics.draw(&pixels, view, self.id)?);
+        if pixels != seen || !self.queue.has_picture() {
+            self.queue.draw(self.graphics.draw(&pixels, view, self.id)?);
         }
         Ok(pixels)
     }

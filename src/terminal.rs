@@ -147,6 +147,11 @@ fn kitty(text: &str, rows: u16, id: u32) -> String {
     told.collect()
 }
 
+/// Characters in a row of the terminal at standard error, at least one.
+pub(crate) fn columns() -> usize {
+    Room::now().columns as usize
+}
+
 /// What the terminal has for a picture.
 struct Room {
     /// Characters in a row.

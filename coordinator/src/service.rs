@@ -423,8 +423,10 @@ impl jobs_server::Jobs for JobsService {
         &self,
         request: Request<wire::CancelRequest>,
     ) -> Result<Response<wire::CancelResponse>, Status> {
+        let holder = request.extensions().get::<Holder>().cloned();
         let wire::CancelRequest { job, farm } = request.into_inner();
         self.shell.admit_client(&farm).map_err(stranger)?;
+        self.check_change(holder, JobId(job))?;
         let was_known = self.shell.cancel(JobId(job));
         Ok(Response::new(wire::CancelResponse { was_known }))
     }
@@ -447,8 +449,10 @@ impl jobs_server::Jobs for JobsService {
         &self,
         request: Request<wire::ControlRequest>,
     ) -> Result<Response<wire::ControlResponse>, Status> {
+        let holder = request.extensions().get::<Holder>().cloned();
         let wire::ControlRequest { job, farm, change } = request.into_inner();
         self.shell.admit_client(&farm).map_err(stranger)?;
+        self.check_change(holder, JobId(job))?;
         let change = match change.ok_or_else(|| invalid(WireError::Missing("change")))? {
             control_request::Change::Paused(is_paused) => Change::Pause(is_paused),
             control_request::Change::Priority(priority) => Change::Priority(priority),
@@ -515,6 +519,25 @@ impl JobsService {
         self.shell.admit_client(farm).map_err(stranger)?;
         let job = self.shell.job(JobId(job));
         job.ok_or_else(|| Status::not_found("there is no such job"))
+    }
+
+    /// Refuses a change of a job by who may submit, and did not order it.
+    fn check_change(&self, holder: Option<Holder>, job: JobId) -> Result<(), Status> {
+        let Some(holder) = holder.filter(|holder| holder.role() != Role::Admin) else {
+            return Ok(());
+        };
+        let account = account(holder.owner());
+        let Some(changed) = self.shell.job(job).filter(|job| job.ticket.account != account) else {
+            return Ok(());
+        };
+        let by = match &*changed.ticket.account {
+            "" => "a token without an owner".to_owned(),
+            owner => format!("the token of {owner}"),
+        };
+        Err(Status::permission_denied(format!(
+            "job {} was ordered by {by}; only such a token and one of the role admin may change it",
+            job.0
+        )))
     }
 }
 
@@ -642,6 +665,11 @@ struct Bundle {
     spool: Spool,
 }
 
+/// Whose jobs are those that this owner's token orders; empty for a token that has no owner.
+fn account(owner: Option<&Owner>) -> String {
+    owner.map(Owner::to_string).unwrap_or_default()
+}
+
 /// What the farm has to do and to keep for an account.
 fn ordered(shell: &Shell, account: &str) -> Ordered {
     let mut all = Ordered::default();
@@ -752,7 +780,7 @@ fn to_ticket(order: &wire::Order, holder: Option<&Owner>) -> Ticket {
     let wire::Order { name, title, owner, key, priority, max_workers, .. } = order.clone();
     let name = if title.is_empty() { name } else { title };
     let most_workers = (max_workers > 0).then_some(max_workers);
-    let account = holder.map(Owner::to_string).unwrap_or_default();
+    let account = account(holder);
     let owner = if account.is_empty() { owner } else { account.clone() };
     let wanted = blake3::hash(&wanted(order.clone()).encode_to_vec()).as_bytes().to_vec();
     Ticket { name, owner, account, key, wanted, priority, most_workers }

@@ -11,7 +11,7 @@ use icy_sixel::SixelImage;
 use image::RgbImage;
 use rustix::{
     pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt},
-    termios::{Winsize, tcgetattr, tcsetwinsize},
+    termios::{Action, Winsize, tcflow, tcgetattr, tcsetwinsize},
 };
 
 use super::*;
@@ -211,4 +211,39 @@ fn a_terminal_is_asked_once_the_scene_is_found_good() {
     drop((command, terminal.inside));
     let said = String::from_utf8(terminal.reading.join().unwrap()).unwrap();
     assert!(said.contains("missing.rt") && !said.contains("\x1b[c"), "{said:?}");
+}
+
+#[test]
+fn a_terminal_that_is_stopped_or_that_nobody_reads_holds_nothing_up() {
+    for (options, is_stopped) in [
+        (&["--preview", "--workers", "2"][..], true),
+        (&["--preview", "--workers", "0"], false),
+        (&["--preview", "--workers", "1", "--verbose"], false),
+        (&["--tile", "8", "--workers", "2"], true),
+        (&["--tile", "8", "--workers", "0"], false),
+        (&["--tile", "8", "--verbose", "--workers", "1"], false),
+    ] {
+        let (place, (_outside, inside)) = (Place::new(), open());
+        if is_stopped {
+            tcflow(&inside, Action::OOff).unwrap();
+        }
+        let mut command = Command::new(env!("CARGO_BIN_EXE_rtfarm"));
+        let child = command
+            .args(["render", "scene.rt", "-o", "out.png", "--size", "640x480", "--samples", "1"])
+            .args(options)
+            .current_dir(place.folder.path())
+            .env("TMPDIR", place.path("tmp"))
+            .env("TERM", "xterm-kitty")
+            .env_remove("RUST_LOG")
+            .env_remove("TMUX")
+            .stdin(Stdio::null())
+            .stdout(inside.try_clone().unwrap())
+            .stderr(inside.try_clone().unwrap())
+            .spawn()
+            .unwrap();
+        let mut process = Process { child, stdout: None, log: PathBuf::new() };
+        assert!(process.wait().success(), "{options:?}");
+        assert!(place.path("out.png").exists(), "{options:?}");
+        place.check_nothing_is_left();
+    }
 }

@@ -137,6 +137,55 @@ fn an_owner_at_the_limit_stops_no_other_and_jobs_are_those_of_the_tokens_owner()
 }
 
 #[test]
+fn a_job_is_changed_by_its_owners_token_and_by_who_looks_after_the_farm() {
+    let place = Place::new();
+    let (_coordinator, _) = start_farm(&place);
+    for owner in ["ada", "bo"] {
+        let words = ["tokens", "renew", "submit", "--owner", owner, "--state", "farm"];
+        assert_eq!(ask(&place, &words).0, Some(0));
+    }
+    let by = |holder: &str, words: &[&str]| {
+        let access = format!("farm/access/{holder}");
+        ask(&place, &[words, &["--access", &access]].concat())
+    };
+    poll(|| by("submit.bo", &["jobs"]).0.filter(|code| *code == 0));
+    let order = ["submit", "scene.rt", "-o", "out.png", "--size", "8x6", "--detach"];
+    for (holder, others, whose) in [
+        ("submit.ada", ["submit.bo", "submit"], "the token of ada"),
+        ("submit", ["submit.bo", "submit.ada"], "a token without an owner"),
+    ] {
+        let order = || {
+            let (code, job) = by(holder, &order);
+            assert_eq!(code, Some(0), "{job}");
+            job.trim().to_owned()
+        };
+        let job = &*order();
+        let changes = [
+            vec!["pause", job],
+            vec!["priority", job, "5"],
+            vec!["resume", job],
+            vec!["retry", job],
+            vec!["cancel", job],
+        ];
+        for change in &changes {
+            for other in others {
+                let (code, said) = by(other, change);
+                let reason = format!("job {job} was ordered by {whose}; only such a token and one");
+                assert!(code == Some(1) && said.contains(&reason), "{other} {change:?}: {said}");
+                assert!(by(other, &["jobs"]).1.contains(job), "others see it");
+            }
+        }
+        for holder in [holder, "admin"] {
+            let job = &*order();
+            for change in [vec!["pause", job], vec!["priority", job, "5"], vec!["cancel", job]] {
+                let (code, said) = by(holder, &change);
+                assert_eq!(code, Some(0), "{holder} {change:?}: {said}");
+            }
+        }
+    }
+}
+
+#[test]
 fn a_key_is_its_accounts_own_and_stands_for_one_order() {
     let place = Place::new();
     let (_coordinator, _) = start_farm(&place);
