@@ -122,9 +122,9 @@ impl Outside for Here<'_> {
     ) -> impl Future<Output = Result<JobsClient<Reached>, Trouble>> + Send + 'static {
         let access = self.access.clone();
         async move {
-            let reached = reach(&access).await.map_err(anyhow::Error::from);
+            let reached = reach(&access).await;
             let address = access.address().clone();
-            reached.map_err(|error| Trouble::Connect(address, format!("{error:#}")))
+            reached.map_err(|error| Trouble::Connect(address, error.to_string()))
         }
     }
 

@@ -207,7 +207,7 @@ fn an_interruption_while_the_terminal_is_asked_leaves_it_as_it_was() {
 fn a_terminal_is_asked_once_the_scene_is_found_good() {
     let (place, terminal) = (Place::new(), Terminal::new(""));
     let mut command = render(&place, "missing.rt", &terminal.inside);
-    assert_eq!(command.status().unwrap().code(), Some(1));
+    assert_eq!(command.status().unwrap().code(), Some(2));
     drop((command, terminal.inside));
     let said = String::from_utf8(terminal.reading.join().unwrap()).unwrap();
     assert!(said.contains("missing.rt") && !said.contains("\x1b[c"), "{said:?}");

@@ -342,7 +342,7 @@ fn who_has_no_token_or_that_of_another_role_or_farm_is_refused_and_told_why() {
     check_refused(
         &place,
         &["tokens", "renew", "read", "--state", "tmp"],
-        1,
+        2,
         "there are no tokens in",
     );
 }
