@@ -4,12 +4,13 @@
 
 use std::{
     fs::{self, File},
-    io::{self, Read},
-    os::fd::OwnedFd,
+    io::{self, Read, Seek, SeekFrom},
+    os::{fd::OwnedFd, unix::fs::FileExt},
     path::{Component, Path, PathBuf},
     sync::atomic::{AtomicU64, Ordering},
 };
 
+use rayon::prelude::*;
 use rustix::{
     fs::{Mode, OFlags, ResolveFlags, open, openat2},
     io::Errno,
@@ -19,6 +20,9 @@ use crate::{args::SceneArgs, output::folder_of};
 
 /// The most bytes that the files of one scene may have together.
 const MOST_BYTES: u64 = 1 << 31;
+
+/// A thread reads so many bytes in one go.
+const READ_AT_ONCE: usize = 1 << 20;
 
 /// A path is looked up so many times when other processes rename what it leads through.
 const ATTEMPTS: usize = 16;
@@ -66,9 +70,14 @@ impl SceneFiles {
         if metadata.len() > left {
             return Err(too_long());
         }
-        let mut data = Vec::with_capacity(metadata.len() as usize);
+        let mut data = vec![0; metadata.len() as usize];
+        let read = |(piece, place): (usize, &mut [u8])| {
+            file.read_exact_at(place, (piece * READ_AT_ONCE) as u64)
+        };
+        data.par_chunks_mut(READ_AT_ONCE).enumerate().try_for_each(read)?;
         // It may grow meanwhile.
-        (&mut file).take(left + 1).read_to_end(&mut data)?;
+        file.seek(SeekFrom::Start(metadata.len()))?;
+        (&mut file).take(left + 1 - metadata.len()).read_to_end(&mut data)?;
         let length = data.len() as u64;
         let taken = self
             .bytes_left

@@ -44,6 +44,7 @@ fn cases() -> Vec<Case> {
             count_faces("a.stl", bytes)
         }),
         ("ASCII STL", ascii_stl(&vertices, &triangles), count, |bytes| count_faces("a.stl", bytes)),
+        ("ASCII PLY", ascii_ply(&vertices, &triangles), count, |bytes| count_faces("a.ply", bytes)),
         ("binary PLY", binary_ply(&vertices, &triangles), count, |bytes| {
             count_faces("a.ply", bytes)
         }),
@@ -172,14 +173,28 @@ fn ascii_stl(vertices: &[[f32; 3]], triangles: &[[usize; 3]]) -> Vec<u8> {
     (text + "endsolid sphere\n").into_bytes()
 }
 
-fn binary_ply(vertices: &[[f32; 3]], triangles: &[[usize; 3]]) -> Vec<u8> {
-    let mut bytes = format!(
-        "ply\nformat binary_little_endian 1.0\nelement vertex {}\nproperty float x\nproperty float y\nproperty float z\n\
+fn ply_header(format: &str, vertices: &[[f32; 3]], triangles: &[[usize; 3]]) -> String {
+    format!(
+        "ply\nformat {format} 1.0\nelement vertex {}\nproperty float x\nproperty float y\nproperty float z\n\
          element face {}\nproperty list uchar int vertex_indices\nend_header\n",
         vertices.len(),
         triangles.len()
     )
-    .into_bytes();
+}
+
+fn ascii_ply(vertices: &[[f32; 3]], triangles: &[[usize; 3]]) -> Vec<u8> {
+    let mut text = ply_header("ascii", vertices, triangles);
+    for [x, y, z] in vertices {
+        writeln!(text, "{x} {y} {z}").expect("strings take all");
+    }
+    for [a, b, c] in triangles {
+        writeln!(text, "3 {a} {b} {c}").expect("strings take all");
+    }
+    text.into_bytes()
+}
+
+fn binary_ply(vertices: &[[f32; 3]], triangles: &[[usize; 3]]) -> Vec<u8> {
+    let mut bytes = ply_header("binary_little_endian", vertices, triangles).into_bytes();
     bytes.extend(vertices.iter().flatten().flat_map(|number| number.to_le_bytes()));
     for triangle in triangles {
         bytes.push(3);

@@ -2,7 +2,10 @@
 
 pub use crate::{
     left_out::{BUILT_WITHOUT, FEATURES},
-    prepare::prepare_with,
+    prepare::{hierarchy_of, prepare_with},
     render::trees::render_trees,
-    trace::probe::{FaceTests, Probe, ProbeHit, Probing},
+    trace::{
+        probe::{FaceTests, Probe, ProbeHit, Probing},
+        timed::TimedKernels,
+    },
 };

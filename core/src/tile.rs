@@ -161,6 +161,13 @@ impl Area {
         Self { x0, y0, width, height, ..self }
     }
 
+    /// The pixel (x, y) of the frame and those beside it that the area has, by their places in it.
+    pub(crate) fn neighbours(self, x: u32, y: u32) -> impl Iterator<Item = u32> + Clone {
+        let [columns, rows] = [(x, self.columns()), (y, self.rows())]
+            .map(|(middle, all)| all.start.max(middle.saturating_sub(1))..all.end.min(middle + 2));
+        rows.flat_map(move |y| columns.clone().map(move |x| self.index_of(x, y)))
+    }
+
     /// Whether it has the pixel (x, y) of the frame.
     pub(crate) fn contains(self, x: u32, y: u32) -> bool {
         self.columns().contains(&x) && self.rows().contains(&y)

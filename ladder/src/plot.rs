@@ -87,8 +87,31 @@ pub enum Legend {
     UpperRight,
 }
 
+/// One plot: bars that lie below each other, from 0 on, each with words on it.
+#[derive(Debug)]
+pub struct Bars {
+    /// What stands above it.
+    pub caption: String,
+    /// What stands below the axis.
+    pub x: &'static str,
+    /// Each bar's length, what stands on it, and its colour's place among the colours.
+    pub bars: Vec<(f64, String, usize)>,
+}
+
 /// Draws panels side by side, two in a row, as one SVG.
 pub fn draw(panels: &[Panel]) -> Result<String, PlotError> {
+    draw_all(panels, Panel::draw)
+}
+
+/// The same for bars.
+pub fn draw_bars(panels: &[Bars]) -> Result<String, PlotError> {
+    draw_all(panels, Bars::draw)
+}
+
+fn draw_all<P>(
+    panels: &[P],
+    draw: for<'a> fn(&P, &Area<'a>) -> Result<(), Failed<'a>>,
+) -> Result<String, PlotError> {
     let columns = panels.len().clamp(1, 2);
     let rows = panels.len().div_ceil(columns);
     let size = (PANEL.0 * columns as u32, PANEL.1 * rows as u32);
@@ -97,11 +120,33 @@ pub fn draw(panels: &[Panel]) -> Result<String, PlotError> {
         let root = SVGBackend::with_string(&mut text, size).into_drawing_area();
         root.fill(&WHITE)?;
         for (panel, area) in panels.iter().zip(root.split_evenly((rows, columns))) {
-            panel.draw(&area)?;
+            draw(panel, &area)?;
         }
         root.present()?;
     }
     Ok(text)
+}
+
+impl Bars {
+    fn draw<'a>(&self, area: &Area<'a>) -> Result<(), Failed<'a>> {
+        let longest = self.bars.iter().map(|bar| bar.0).fold(0.0, f64::max);
+        let mut chart = ChartBuilder::on(area)
+            .caption(&self.caption, ("sans-serif", 16))
+            .margin(10)
+            .x_label_area_size(36)
+            .build_cartesian_2d(0.0..longest * 1.5, self.bars.len() as f64..0.0)?;
+        chart.configure_mesh().disable_y_mesh().x_desc(self.x).light_line_style(WHITE).draw()?;
+        chart.draw_series((0..).map(f64::from).zip(&self.bars).map(
+            |(y, &(length, _, color))| {
+                let color = COLORS[color % COLORS.len()].mix(0.6).filled();
+                Rectangle::new([(0.0, y + 0.1), (length, y + 0.9)], color)
+            },
+        ))?;
+        chart.draw_series((0..).map(f64::from).zip(&self.bars).map(|(y, (_, words, _))| {
+            Text::new(words.clone(), (longest * 0.01, y + 0.25), ("sans-serif", 11))
+        }))?;
+        Ok(())
+    }
 }
 
 impl Panel {

@@ -14,7 +14,7 @@ use rtfarm_core::{
 use rtfarm_oracle::{Oracle, random::Random};
 
 /// Triangles along an edge of the octahedron that the mesh is made from: 8 · 45² in all.
-const ALONG: i32 = 45;
+pub(crate) const ALONG: i32 = 45;
 
 /// Rays in one call of a kernel: few enough that they stay in the cache.
 const BATCH: usize = 4096;
@@ -86,15 +86,15 @@ pub(crate) struct Mesh {
 
 impl Mesh {
     pub(crate) fn all() -> impl Iterator<Item = Self> {
-        MOVES.into_iter().map(Self::new)
+        MOVES.into_iter().map(|moved| Self::new(ALONG, moved))
     }
 
-    /// The sphere about (moved, moved, moved). Its corners fit in single precision where that
-    /// leaves a sphere.
-    fn new(moved: f64) -> Self {
+    /// The sphere about (moved, moved, moved) of 8 · `along`² triangles. Its corners fit in single
+    /// precision where that leaves a sphere.
+    pub(crate) fn new(along: i32, moved: f64) -> Self {
         let is_single = moved < 1e6;
         let corner = |signs: [f64; 3], [i, j]: [i32; 2]| {
-            let flat = [i, j, ALONG - i - j].map(f64::from);
+            let flat = [i, j, along - i - j].map(f64::from);
             let place = DVec3::from_array([0, 1, 2].map(|axis| signs[axis] * flat[axis]));
             in_single(place.normalize() + moved, is_single)
         };
@@ -112,10 +112,10 @@ impl Mesh {
                     });
                 }
             };
-            for i in 0..ALONG {
-                for j in 0..ALONG - i {
+            for i in 0..along {
+                for j in 0..along - i {
                     add([[i, j], [i + 1, j], [i, j + 1]]);
-                    if i + j + 2 <= ALONG {
+                    if i + j + 2 <= along {
                         add([[i + 1, j], [i + 1, j + 1], [i, j + 1]]);
                     }
                 }
@@ -125,17 +125,7 @@ impl Mesh {
     }
 
     fn prepared(&self) -> PreparedScene<PreparedBytes> {
-        let triangles = (0..).zip(&self.triangles);
-        let scene = Scene {
-            viewport: Some(Viewport {
-                eye: DVec3::ZERO,
-                top_left: DVec3::new(-1.0, 1.0, -1.0),
-                bottom_left: DVec3::new(-1.0, -1.0, -1.0),
-                top_right: DVec3::new(1.0, 1.0, -1.0),
-            }),
-            ..scene_of(triangles)
-        };
-        PreparedScene::open(prepare(&scene).expect("a plain mesh")).expect("what was just prepared")
+        prepared(&visible(&self.triangles))
     }
 
     fn rays(&self, aim: Aim, count: usize) -> Vec<Probe> {
@@ -165,6 +155,21 @@ impl Mesh {
         };
         (0..self.triangles.len()).filter(|&k| is_near(&self.triangles[k])).collect()
     }
+}
+
+/// A mesh, and an eye that sees it.
+pub(crate) fn visible(triangles: &[[DVec3; 3]]) -> Scene {
+    let viewport = Viewport {
+        eye: DVec3::ZERO,
+        top_left: DVec3::new(-1.0, 1.0, -1.0),
+        bottom_left: DVec3::new(-1.0, -1.0, -1.0),
+        top_right: DVec3::new(1.0, 1.0, -1.0),
+    };
+    Scene { viewport: Some(viewport), ..scene_of((0..).zip(triangles)) }
+}
+
+pub(crate) fn prepared(scene: &Scene) -> PreparedScene<PreparedBytes> {
+    PreparedScene::open(prepare(scene).expect("a plain mesh")).expect("what was just prepared")
 }
 
 /// Numbered triangles alone.

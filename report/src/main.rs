@@ -6,6 +6,7 @@
 mod branches;
 mod kernels;
 mod peers;
+mod race;
 mod tables;
 
 use std::{
@@ -18,7 +19,7 @@ use std::{
 
 use anyhow::Context;
 use clap::Parser;
-use rtfarm_core::{prepare::prepare, prepared::PreparedScene};
+use rtfarm_core::{isa::Isa, prepare::prepare, prepared::PreparedScene};
 use rtfarm_ladder::{ERROR_PLOT, Effort, Ladder, Reach, Report, Subject, figures::Truth, plot};
 use rtfarm_oracle::known_pictures::{KnownPicture, indirect_pictures, known_pictures, known_size};
 
@@ -45,6 +46,14 @@ struct Args {
     /// Only write these scenes and rays into a folder, for the same effort.
     #[arg(long, value_name = "DIR")]
     for_peers: Option<PathBuf>,
+
+    /// Only trace the rays in a folder as standard input orders, as other programs' kernels do.
+    #[arg(long, value_name = "DIR", conflicts_with_all = ["for_peers", "peers", "out"])]
+    race: Option<PathBuf>,
+
+    /// The instruction set of `--race`.
+    #[arg(long, value_name = "ISA", requires = "race", default_value_t = Isa::fastest())]
+    isa: Isa,
 }
 
 /// How much work a report is.
@@ -101,7 +110,11 @@ fn main() -> ExitCode {
 fn run(args: &Args) -> anyhow::Result<()> {
     let plan = Plan::new(args.effort);
     if let Some(folder) = &args.for_peers {
-        return peers::write(folder, known_size(plan.peers_width), plan.kernels.rays);
+        peers::write(folder, known_size(plan.peers_width), plan.kernels.rays)?;
+        return race::write(folder, plan.kernels);
+    }
+    if let Some(folder) = &args.race {
+        return race::serve(folder, args.isa);
     }
     let report = measure(&plan, args.peers.as_deref())?;
     match &args.out {
@@ -135,6 +148,7 @@ fn measure(plan: &Plan, peers: Option<&Path>) -> anyhow::Result<Report> {
         None => Ok(Vec::new()),
     };
 
+    let race = peers.map(race::read).transpose()?.unwrap_or_default();
     let cases = Case::measure_all(plan.kernels, &kernels_of)?;
     let known = known_pictures(plan.width).into_iter().chain(indirect_pictures(plan.width));
     let ladders: Vec<Ladder> =
@@ -148,11 +162,15 @@ fn measure(plan: &Plan, peers: Option<&Path>) -> anyhow::Result<Report> {
     }
 
     let branches = branches::table(plan.width / 2, plan.reach.seeds);
-    let text = tables::on_known(&ladders, &ladders_beside, &branches, &cases, plan.kernels);
+    let kernels = (&cases[..], &race[..], plan.kernels);
+    let text = tables::on_known(&ladders, &ladders_beside, &branches, kernels);
     let mut plots = vec![
         (ERROR_PLOT, plot::draw_errors(&ladders)?),
         (tables::KERNEL_PLOT, tables::draw_kernels(&cases)?),
     ];
+    if !race.is_empty() {
+        plots.push((tables::RACE_PLOT, race::draw(&race)?));
+    }
     if !ladders_beside.is_empty() {
         plots.push((tables::PEERS_PLOT, plot::draw_errors(&ladders_beside)?));
     }

@@ -25,7 +25,7 @@ const KERNELS: &str = "kernels.tsv";
 
 /// Writes what other programs are to work on: every scene of [`known_texts`] as `NAME.rt`,
 /// `size` with the pictures' width and height, `mesh-MOVED` with nine little-endian f32 a triangle
-/// and `rays-MOVED-AIM` with six a ray: origin and direction.
+/// and `rays-MOVED-AIM` with eight a ray: origin, direction, reach and one that counts nothing.
 pub(crate) fn write(folder: &Path, size: Size, rays: usize) -> anyhow::Result<()> {
     fs::create_dir_all(folder)
         .with_context(|| format!("cannot make the folder {}", folder.display()))?;
@@ -47,8 +47,11 @@ pub(crate) fn write(folder: &Path, size: Size, rays: usize) -> anyhow::Result<()
             let mesh_bytes = bytes(&mut corners.flat_map(|corner: &DVec3| corner.to_array()));
             put(&format!("mesh-{:e}", case.moved), &mesh_bytes)?;
             let rays = case.rays.iter().map(rounded);
-            let numbers = rays.flat_map(|ray| [ray.origin, ray.direction]);
-            let ray_bytes = bytes(&mut numbers.flat_map(|vector| vector.to_array()));
+            let numbers = rays.flat_map(|ray| {
+                let [[x, y, z], [dx, dy, dz]] = [ray.origin, ray.direction].map(|v| v.to_array());
+                [x, y, z, dx, dy, dz, f64::INFINITY, f64::INFINITY]
+            });
+            let ray_bytes = bytes(&mut numbers.into_iter());
             put(&format!("rays-{:e}-{}", case.moved, case.aim.name()), &ray_bytes)?;
         }
     }
@@ -56,7 +59,7 @@ pub(crate) fn write(folder: &Path, size: Size, rays: usize) -> anyhow::Result<()
 }
 
 /// The lines of a file that may be missing, in columns.
-fn lines<const COLUMNS: usize>(path: &Path) -> anyhow::Result<Vec<[String; COLUMNS]>> {
+pub(crate) fn lines<const COLUMNS: usize>(path: &Path) -> anyhow::Result<Vec<[String; COLUMNS]>> {
     let text = match fs::read_to_string(path) {
         Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(Vec::new()),
         read => read.with_context(|| format!("cannot read {}", path.display()))?,
@@ -69,7 +72,7 @@ fn lines<const COLUMNS: usize>(path: &Path) -> anyhow::Result<Vec<[String; COLUM
     text.lines().enumerate().map(columns).collect()
 }
 
-fn numbers(text: &str) -> anyhow::Result<Vec<f64>> {
+pub(crate) fn numbers(text: &str) -> anyhow::Result<Vec<f64>> {
     let numbers: Result<Vec<f64>, _> = text.split(',').map(str::parse).collect();
     let numbers = numbers.with_context(|| format!("`{text}` are no numbers"))?;
     ensure!(numbers.iter().all(|&number| number > 0.0), "`{text}`: all should be above 0");

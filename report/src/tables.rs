@@ -9,11 +9,15 @@ use rtfarm_ladder::{
     tables::{LEGEND, WANTED, method, table},
 };
 
-use crate::kernels::{Amount, Case, Kernel, names};
+use crate::{
+    kernels::{Amount, Case, Kernel, names},
+    race::{self, Row},
+};
 
 /// The plots beside that of error against time.
 pub(crate) const PEERS_PLOT: &str = "peers.svg";
 pub(crate) const KERNEL_PLOT: &str = "kernels.svg";
+pub(crate) const RACE_PLOT: &str = "race.svg";
 
 /// The report on pictures and distances that are known; `beside` other renderers, `branches` the
 /// section on what is followed by chance.
@@ -21,8 +25,7 @@ pub(crate) fn on_known(
     ladders: &[Ladder],
     beside: &[Ladder],
     branches: &str,
-    cases: &[Case],
-    amount: Amount,
+    (cases, race, amount): (&[Case], &[Row], Amount),
 ) -> String {
     let mut text = format!(
         "# Speed against error\n\nTruth is a closed form for every pixel. {LEGEND}\
@@ -35,6 +38,9 @@ pub(crate) fn on_known(
     }
     text += branches;
     text += &kernels(cases, amount);
+    if !race.is_empty() {
+        text += &race::tables(race, RACE_PLOT);
+    }
     text += &method(ladders);
     let _ = writeln!(
         text,

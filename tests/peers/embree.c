@@ -1,18 +1,28 @@
-/* What Embree 3 meets of the rays that `rtfarm-report --for-peers FOLDER` wrote.
+/* Embree 3's kernels, which trace what they are told to on standard input.
  *
- *     gcc -O3 -o embree embree.c -lembree3 && ./embree FOLDER RUNS MOVED...
+ *     gcc -O3 -o embree embree.c -lembree3 && ./embree FOLDER avx2|avx512 fast|robust
  *
- * Leaves the distances as `rtfarm-report --peers` reads them and prints a line of kernels.tsv each:
- * one thread, one ray a call, the fast and the robust mode by turns. The time includes the copy of
- * a ray into Embree's own form. */
+ * Every line is one order and gets one line of numbers in answer:
+ *
+ *     build MESH                     seconds and bytes that the default build takes
+ *     trace meet|block GROUP RAYS    seconds; GROUP is 1 or 64, the rays that one call gets
+ *     tell FILE                      how many distances of the last rays went into a file
+ *
+ * A mesh is a file of nine little-endian f32 a triangle; rays have eight: start, direction, reach and
+ * one that is not read. A distance is an f32: infinite for nothing, 0 for something in the way. One
+ * thread; times include the copy of rays into Embree's own form. Groups are said to be coherent. */
 #include <embree3/rtcore.h>
 #include <math.h>
+#include <pmmintrin.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
 #include <time.h>
 
-#define MOST_RUNS 99
+#define GROUP 64
+
+static const char *folder;
+static long long bytes;
 
 static double seconds(void) {
     struct timespec now;
@@ -20,14 +30,25 @@ static double seconds(void) {
     return now.tv_sec + 1e-9 * now.tv_nsec;
 }
 
-static float *read_numbers(const char *folder, const char *name, size_t *count) {
+static bool on_memory(void *nothing, ssize_t more, bool post) {
+    (void)nothing, (void)post;
+    bytes += more;
+    return true;
+}
+
+static FILE *open_file(const char *name, const char *mode) {
     char path[4096];
     snprintf(path, sizeof path, "%s/%s", folder, name);
-    FILE *file = fopen(path, "rb");
+    FILE *file = fopen(path, mode);
     if (!file) {
         perror(path);
         exit(1);
     }
+    return file;
+}
+
+static float *read_numbers(const char *name, size_t *count) {
+    FILE *file = open_file(name, "rb");
     fseek(file, 0, SEEK_END);
     *count = ftell(file) / sizeof(float);
     rewind(file);
@@ -44,7 +65,10 @@ static int by_place(const void *a, const void *b) {
     return memcmp(all_corners + 3 * *(const unsigned *)a, all_corners + 3 * *(const unsigned *)b, 12);
 }
 
-static RTCScene make_scene(RTCDevice device, const float *corners, size_t count, int is_robust) {
+static RTCScene build(RTCDevice device, const char *name, int is_robust) {
+    size_t count;
+    float *corners = read_numbers(name, &count);
+    count /= 3;
     unsigned *order = malloc(count * sizeof(unsigned)), *place = malloc(count * sizeof(unsigned));
     for (size_t k = 0; k < count; k++) order[k] = k;
     all_corners = corners;
@@ -55,82 +79,92 @@ static RTCScene make_scene(RTCDevice device, const float *corners, size_t count,
         if (k == 0 || by_place(&order[k - 1], &order[k])) memcpy(shared + 3 * used++, corners + 3 * order[k], 12);
         place[order[k]] = used - 1;
     }
+    bytes = 0;
     RTCGeometry geometry = rtcNewGeometry(device, RTC_GEOMETRY_TYPE_TRIANGLE);
     memcpy(rtcSetNewGeometryBuffer(geometry, RTC_BUFFER_TYPE_VERTEX, 0, RTC_FORMAT_FLOAT3, 12, used), shared, 12 * used);
     memcpy(rtcSetNewGeometryBuffer(geometry, RTC_BUFFER_TYPE_INDEX, 0, RTC_FORMAT_UINT3, 12, count / 3), place, 4 * count);
+    double start = seconds();
     rtcCommitGeometry(geometry);
     RTCScene scene = rtcNewScene(device);
     rtcSetSceneFlags(scene, is_robust ? RTC_SCENE_FLAG_ROBUST : RTC_SCENE_FLAG_NONE);
-    rtcSetSceneBuildQuality(scene, RTC_BUILD_QUALITY_HIGH);
     rtcAttachGeometry(scene, geometry);
     rtcReleaseGeometry(geometry);
     rtcCommitScene(scene);
-    free(order), free(place), free(shared);
+    printf("%.9g %lld\n", seconds() - start, bytes);
+    free(order), free(place), free(shared), free(corners);
     return scene;
 }
 
-static void meet(RTCScene scene, const float *rays, size_t count, float *distances) {
+static void set(struct RTCRay *ray, const float *r) {
+    *ray = (struct RTCRay){.org_x = r[0], .org_y = r[1], .org_z = r[2], .dir_x = r[3], .dir_y = r[4],
+                           .dir_z = r[5], .tfar = r[6], .mask = ~0u};
+}
+
+static void trace(RTCScene scene, int is_block, size_t group, const float *rays, size_t count, float *distances) {
     struct RTCIntersectContext context;
     rtcInitIntersectContext(&context);
-    for (size_t k = 0; k < count; k++) {
-        const float *r = rays + 6 * k;
-        struct RTCRayHit hit = {.ray = {.org_x = r[0], .org_y = r[1], .org_z = r[2],
-                                        .dir_x = r[3], .dir_y = r[4], .dir_z = r[5],
-                                        .tfar = INFINITY, .mask = ~0u},
-                                .hit = {.geomID = RTC_INVALID_GEOMETRY_ID}};
-        rtcIntersect1(scene, &context, &hit);
-        distances[k] = hit.hit.geomID == RTC_INVALID_GEOMETRY_ID ? INFINITY : hit.ray.tfar;
+    if (group > 1) context.flags = RTC_INTERSECT_CONTEXT_FLAG_COHERENT;
+    struct RTCRayHit hits[GROUP];
+    struct RTCRay blocked[GROUP];
+    for (size_t k = 0; k < count; k += group) {
+        size_t some = count - k < group ? count - k : group;
+        if (is_block) {
+            for (size_t i = 0; i < some; i++) set(&blocked[i], rays + 8 * (k + i));
+            if (group == 1) rtcOccluded1(scene, &context, blocked);
+            else rtcOccluded1M(scene, &context, blocked, some, sizeof *blocked);
+            for (size_t i = 0; i < some; i++) distances[k + i] = blocked[i].tfar < 0 ? 0 : INFINITY;
+        } else {
+            for (size_t i = 0; i < some; i++) {
+                set(&hits[i].ray, rays + 8 * (k + i));
+                hits[i].hit.geomID = hits[i].hit.instID[0] = RTC_INVALID_GEOMETRY_ID;
+            }
+            if (group == 1) rtcIntersect1(scene, &context, hits);
+            else rtcIntersect1M(scene, &context, hits, some, sizeof *hits);
+            for (size_t i = 0; i < some; i++)
+                distances[k + i] = hits[i].hit.geomID == RTC_INVALID_GEOMETRY_ID ? INFINITY : hits[i].ray.tfar;
+        }
     }
 }
 
 int main(int argc, char **argv) {
-    if (argc < 4) {
-        fprintf(stderr, "usage: embree FOLDER RUNS MOVED...\n");
+    if (argc != 4) {
+        fprintf(stderr, "usage: embree FOLDER avx2|avx512 fast|robust\n");
         return 2;
     }
-    const char *folder = argv[1], *aims[] = {"edges", "corners", "anywhere"}, *modes[] = {"fast", "robust"};
-    int runs = atoi(argv[2]);
-    if (runs < 1 || runs > MOST_RUNS) return 2;
-    RTCDevice device = rtcNewDevice("threads=1");
-    long version = rtcGetDeviceProperty(device, RTC_DEVICE_PROPERTY_VERSION);
-    for (int m = 3; m < argc; m++) {
-        char name[256];
-        size_t count;
-        snprintf(name, sizeof name, "mesh-%s", argv[m]);
-        float *corners = read_numbers(folder, name, &count);
-        RTCScene scenes[] = {make_scene(device, corners, count / 3, 0), make_scene(device, corners, count / 3, 1)};
-        for (int a = 0; a < 3; a++) {
-            snprintf(name, sizeof name, "rays-%s-%s", argv[m], aims[a]);
-            float *rays = read_numbers(folder, name, &count);
-            count /= 6;
-            float *distances = malloc(count * sizeof(float));
-            double speeds[2][MOST_RUNS];
-            for (int run = 0; run < runs; run++)
-                for (int mode = 0; mode < 2; mode++) {
-                    double start = seconds();
-                    meet(scenes[mode], rays, count, distances);
-                    speeds[mode][run] = count / (seconds() - start) / 1e6;
-                }
-            for (int mode = 0; mode < 2; mode++) {
-                char path[4096];
-                meet(scenes[mode], rays, count, distances);
-                snprintf(name, sizeof name, "embree-%s-%s-%s", modes[mode], argv[m], aims[a]);
-                snprintf(path, sizeof path, "%s/%s", folder, name);
-                FILE *file = fopen(path, "wb");
-                if (!file || fwrite(distances, sizeof(float), count, file) != count || fclose(file)) {
-                    perror(path);
-                    return 1;
-                }
-                printf("Embree %ld.%ld.%ld %s\t%s\t%s\t", version / 10000, version / 100 % 100, version % 100,
-                       modes[mode], argv[m], aims[a]);
-                for (int run = 0; run < runs; run++) printf("%s%.4f", run ? "," : "", speeds[mode][run]);
-                printf("\t%s\n", name);
+    folder = argv[1];
+    _MM_SET_FLUSH_ZERO_MODE(_MM_FLUSH_ZERO_ON);
+    _MM_SET_DENORMALS_ZERO_MODE(_MM_DENORMALS_ZERO_ON);
+    char config[64], line[256], what[64], name[128], last[128] = "";
+    snprintf(config, sizeof config, "threads=1,isa=%s", argv[2]);
+    RTCDevice device = rtcNewDevice(config);
+    rtcSetDeviceMemoryMonitorFunction(device, on_memory, NULL);
+    RTCScene scene = NULL;
+    float *rays = NULL, *distances = NULL;
+    size_t count = 0, group;
+    while (fgets(line, sizeof line, stdin)) {
+        if (sscanf(line, "build %127s", name) == 1) {
+            if (scene) rtcReleaseScene(scene);
+            scene = build(device, name, !strcmp(argv[3], "robust"));
+        } else if (scene && sscanf(line, "trace %63s %zu %127s", what, &group, name) == 3 && (group == 1 || group == GROUP)) {
+            if (strcmp(name, last)) {
+                free(rays), free(distances);
+                rays = read_numbers(name, &count);
+                count /= 8;
+                distances = malloc(count * sizeof(float));
+                strcpy(last, name);
             }
-            free(distances), free(rays);
+            double start = seconds();
+            trace(scene, !strcmp(what, "block"), group, rays, count, distances);
+            printf("%.9g\n", seconds() - start);
+        } else if (sscanf(line, "tell %127s", name) == 1) {
+            FILE *file = open_file(name, "wb");
+            if (fwrite(distances, sizeof(float), count, file) != count || fclose(file)) return 1;
+            printf("%zu\n", count);
+        } else {
+            fprintf(stderr, "embree: cannot do: %s", line);
+            return 2;
         }
-        rtcReleaseScene(scenes[0]), rtcReleaseScene(scenes[1]);
-        free(corners);
+        fflush(stdout);
     }
-    rtcReleaseDevice(device);
     return 0;
 }

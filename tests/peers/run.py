@@ -2,7 +2,7 @@
 """Run other renderers on what `rtfarm-report --for-peers FOLDER` wrote; leave what they made for
 `rtfarm-report --peers FOLDER`.
 
-    python3 run.py FOLDER CONVERTERS [--runs 9] [--most 256]
+    python3 run.py FOLDER CONVERTERS [--report rtfarm-report] [--runs 9] [--most 256] [--only WHAT]
 
 CONVERTERS is a folder with rt.py, to_pov.py, to_tachyon.py and to_mitsuba.py, which turn a scene
 into the renderer's own format. POV-Ray (povray), Tachyon (tachyon), Mitsuba 3 (the wheel in the
@@ -20,6 +20,7 @@ Scenes without a light show plain colours: the converted scene then has surfaces
 themselves.
 """
 import argparse
+import array
 import os
 import re
 import subprocess
@@ -198,18 +199,103 @@ def pictures(args, rt):
             aloud(f'{version}: {name}')
 
 
-def kernels(args):
-    """The lines of kernels.tsv."""
+class Kernels:
+    """A program that traces what it is told to, as embree.c says: one order a line, one line of numbers back."""
+
+    def __init__(self, name, isa, groups, command, **more):
+        self.name, self.isa, self.groups = name, isa, groups
+        self.process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, **more)
+
+    def ask(self, *order):
+        self.process.stdin.write(' '.join(map(str, order)) + '\n')
+        self.process.stdin.flush()
+        return [float(number) for number in self.process.stdout.readline().split()]
+
+    def end(self):
+        self.process.stdin.close()
+        self.process.wait()
+
+
+def embree(folder):
+    """Embree's kernels, built once; nothing, aloud, where it is missing."""
+    program = os.path.join(folder, 'embree')
+    try:
+        call(['gcc', '-O3', '-o', program, os.path.join(HERE, 'embree.c'), '-lembree3'])
+    except (OSError, RuntimeError):
+        aloud('SKIPPED: Embree 3 is not there (gcc, libembree-dev)')
+        return None
+    return program
+
+
+def isas():
+    with open('/proc/cpuinfo') as f:
+        flags = f.read().split()
+    return [isa for isa, flag in (('avx2', 'avx2'), ('avx512', 'avx512vl')) if flag in flags]
+
+
+def kernels(args, program):
+    """The lines of kernels.tsv: one ray a call."""
     moves = sorted(file[5:] for file in os.listdir(args.folder) if file.startswith('mesh-'))
-    with tempfile.TemporaryDirectory() as folder:
-        program = os.path.join(folder, 'embree')
-        try:
-            call(['gcc', '-O3', '-o', program, os.path.join(HERE, 'embree.c'), '-lembree3'])
-        except (OSError, RuntimeError):
-            aloud('SKIPPED: Embree 3 is not there (gcc, libembree-dev)')
-            return
-        yield from call([program, args.folder, str(args.runs), *moves]).splitlines()
-        aloud('Embree: done')
+    for mode in ('fast', 'robust') if program else ():
+        tracer = Kernels(f'Embree 3 {mode}', isas()[-1], (1,), [program, args.folder, isas()[-1], mode])
+        for move in moves:
+            tracer.ask('build', f'mesh-{move}')
+            for aim in ('edges', 'corners', 'anywhere'):
+                rays = f'rays-{move}-{aim}'
+                count = os.path.getsize(os.path.join(args.folder, rays)) / 32
+                times = [tracer.ask('trace', 'meet', 1, rays)[0] for _ in range(args.runs + 1)][1:]
+                tracer.ask('tell', f'embree-{mode}-{move}-{aim}')
+                speeds = ','.join(f'{count / time / 1e6:.4f}' for time in times)
+                yield '\t'.join((tracer.name, move, aim, speeds, f'embree-{mode}-{move}-{aim}'))
+        tracer.end()
+        aloud(f'{tracer.name}: done')
+
+
+def numbers(path):
+    values = array.array('f')
+    with open(path, 'rb') as f:
+        values.frombytes(f.read())
+    return values
+
+
+def race(args, program):
+    """The lines of race.tsv: every program takes its turn in every run."""
+    if not args.report:
+        return
+    racers = []
+    for isa in isas():
+        command = [args.report, '--race', args.folder, '--isa', isa]
+        racers.append(Kernels('rtfarm', isa, (64,), command, env={**os.environ, 'RAYON_NUM_THREADS': '1'}))
+        for mode in ('fast', 'robust') if program else ():
+            racers.append(Kernels(f'Embree {mode}', isa, (1, 64), [program, args.folder, isa, mode]))
+    meshes = {int(file[5:]) for file in os.listdir(args.folder) if re.fullmatch(r'race-\d+', file)}
+    for count in sorted(meshes):
+        mesh = f'race-{count}'
+        built = [[racer.ask('build', mesh) for racer in racers] for _ in range(args.builds)]
+        for racer, runs in zip(racers, zip(*built)):
+            seconds = lambda k: ','.join(f'{run[k]:.4g}' for run in runs)
+            row = [count, 'build', racer.isa, racer.name, seconds(0), int(runs[0][1]), count]
+            yield '\t'.join(map(str, row))
+            if len(runs[0]) > 2:
+                yield '\t'.join(map(str, [count, 'build', racer.isa, racer.name + ' all', seconds(2), *row[5:]]))
+        for name in ('camera', 'shadow', 'anywhere'):
+            rays = f'{mesh}-{name}'
+            way = 'block' if name == 'shadow' else 'meet'
+            turns = [(racer, group) for racer in racers for group in racer.groups]
+            times = [[racer.ask('trace', way, group, rays)[0] for racer, group in turns]
+                     for _ in range(args.runs + 1)][1:]
+            most = numbers(os.path.join(args.folder, rays))[7::8]
+            for (racer, group), runs in zip(turns, zip(*times)):
+                racer.ask('trace', way, group, rays)
+                racer.ask('tell', 'distances')
+                distances = numbers(os.path.join(args.folder, 'distances'))
+                leaks = sum(distance > limit for distance, limit in zip(distances, most))
+                how = '' if racer.groups == (64,) else ' single' if group == 1 else ' streams'
+                speeds = ','.join(f'{len(most) / time / 1e6:.4f}' for time in runs)
+                yield '\t'.join((str(count), name, racer.isa, racer.name + how, speeds, str(leaks), str(len(most))))
+        aloud(f'kernels on {count} triangles: done')
+    for racer in racers:
+        racer.end()
 
 
 def main():
@@ -217,6 +303,9 @@ def main():
     args.add_argument('folder')
     args.add_argument('converters')
     args.add_argument('--runs', type=int, default=9)
+    args.add_argument('--builds', type=int, default=3)
+    args.add_argument('--report', help='rtfarm-report, whose kernels take turns with Embree\'s')
+    args.add_argument('--only', choices=('kernels', 'race', 'pictures'))
     args.add_argument('--most', type=int, default=256, help='samples a pixel')
     args = args.parse_args()
     if not os.path.isfile(os.path.join(args.converters, 'rt.py')):
@@ -224,11 +313,15 @@ def main():
     sys.dont_write_bytecode = True
     sys.path.insert(0, args.converters)
     import rt
-    for name, lines in (('kernels.tsv', kernels(args)), ('pictures.tsv', pictures(args, rt))):
-        with open(os.path.join(args.folder, name), 'w') as f:
-            for line in lines:
-                f.write(line + '\n')
-                f.flush()
+    with tempfile.TemporaryDirectory() as folder:
+        program = embree(folder)
+        made = {'kernels': kernels(args, program), 'race': race(args, program), 'pictures': pictures(args, rt)}
+        for name, lines in made.items():
+            if args.only in (None, name):
+                with open(os.path.join(args.folder, name + '.tsv'), 'w') as f:
+                    for line in lines:
+                        f.write(line + '\n')
+                        f.flush()
 
 
 if __name__ == '__main__':

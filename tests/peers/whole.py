@@ -2,7 +2,7 @@
 """Time whole commands of rtfarm and of other renderers: meshes and spheres beside Mitsuba, solids beside
 POV-Ray with the same samples, and with as few as an error needs.
 
-    python3 whole.py RTFARM CONVERTERS [--runs 3] [--only meshes|same|adaptive] [--quiet COMMAND]
+    python3 whole.py RTFARM CONVERTERS [--runs 3] [--only meshes|equal|same|adaptive] [--quiet COMMAND]
 
 RTFARM is the program, CONVERTERS the folder with rt.py, to_pov.py, to_mitsuba.py, mitsuba_run.py and
 gen_scenes.py. Prints tables of medians of runs that take turns; one whose renderer is missing is
@@ -17,6 +17,7 @@ round of commands that are timed.
 """
 import argparse
 import json
+import math
 import os
 import re
 import shlex
@@ -32,10 +33,13 @@ import zlib
 from run import PYTHON, by_lines
 
 SCENES = os.path.join(os.path.dirname(os.path.abspath(__file__)), '..', '..', 'scenes')
-MESHES = [('bottle, 100 000 triangles, front', 'bottle 100000 --view front', [1, 16]),
-          ('bottle, 100 000 triangles, filling the frame', 'bottle 100000 --view fill', [1, 16]),
-          ('bottle, 1 000 000 triangles, front', 'bottle 1000000 --view front', [1, 16]),
-          ('100 000 spheres', 'spheres 100000', [1, 16])]
+MESHES = [('bottle, 100 000 triangles, front', 'bottle 100000 --view front'),
+          ('bottle, 100 000 triangles, filling the frame', 'bottle 100000 --view fill'),
+          ('bottle, 1 000 000 triangles, front', 'bottle 1000000 --view front'),
+          ('100 000 spheres', 'spheres 100000'),
+          ('mirrors', 'mirrors')]
+# Rays that a path has in a row at most: rtfarm traces depths 0 to 64.
+DEPTH = 65
 SAME = [('gnome', 640, 360), ('gnome', 1280, 720), ('solids', 640, 360)]
 GRID = '+A0.0 +AM1 +R4 -J'
 ADAPTIVE = ['+A0.3 +AM2 +R2 -J', '+A0.1 +AM2 +R3 -J', '+A0.03 +AM2 +R4 -J', '+A0.01 +AM2 +R5 -J']
@@ -162,31 +166,81 @@ class Bench:
         runs = [self.timed(commands) for _ in range(self.args.runs)]
         return [[statistics.median(times) for times in zip(*of)] for of in zip(*runs)]
 
-    def meshes(self):
-        if subprocess.run([PYTHON, '-c', 'import mitsuba'], stderr=subprocess.DEVNULL).returncode:
-            return skip('meshes: there is no Mitsuba in the Python of MITSUBA_PYTHON')
-        converter = lambda name: os.path.join(self.args.converters, name)
-        print('| 1280 x 720 | samples | Mitsuba: wall, processor s; MB | rtfarm | Mitsuba / rtfarm |'
-              '\n|---|---|---|---|---|')
+    def generated(self, scene):
+        """The path of a scene of gen_scenes.py, told as its arguments."""
         # Not beside the links to the project's scenes, which are written through.
         made = os.path.join(self.folder, 'made')
-        os.mkdir(made)
-        for name, scene, counts in MESHES:
-            kind, count, *view = scene.split()
-            source = os.path.join(made, kind + '.rt')
-            run([sys.executable, converter('gen_scenes.py'), kind, count, source, *view])
-            for samples in counts:
-                xml = os.path.join(made, kind + '.xml')
-                run([sys.executable, converter('to_mitsuba.py'), source, xml, '1280', '720', '--spp', str(samples)])
-                peer = [PYTHON, converter('mitsuba_run.py'), xml, self.picture('mitsuba', 'mesh'), '--whitted', '9']
-                own = [self.args.rtfarm, 'render', source, '-o', self.picture('rtfarm', 'mesh'), '--size', '1280x720',
-                       '--samples', str(samples), '--secondary', 'off', '--no-cache']
+        os.makedirs(made, exist_ok=True)
+        kind, *rest = scene.split()
+        source = os.path.join(made, '-'.join(scene.split()) + '.rt')
+        if not os.path.exists(source):
+            run([sys.executable, self.converter('gen_scenes.py'), kind, *rest[:1], source, *rest[1:]])
+        return source
+
+    def converter(self, name):
+        return os.path.join(self.args.converters, name)
+
+    def mitsuba(self, source, samples, sampler='independent'):
+        xml = f'{source}-{samples}.xml'
+        run([sys.executable, self.converter('to_mitsuba.py'), source, xml, '1280', '720', '--spp', str(samples)])
+        with open(xml) as f:
+            converted = f.read()
+        with open(xml, 'w') as f:
+            f.write(converted.replace('sampler type="independent"', f'sampler type="{sampler}"'))
+        return [PYTHON, self.converter('mitsuba_run.py'), xml, self.picture('mitsuba', 'mesh'),
+                '--whitted', str(DEPTH)]
+
+    def whole(self, source, flags):
+        return [self.args.rtfarm, 'render', source, '-o', self.picture('rtfarm', 'mesh'), '--size', '1280x720',
+                '--secondary', 'off', '--no-cache', *flags.split()]
+
+    def meshes(self):
+        print('| 1280 x 720 | samples | Mitsuba: wall, processor s; MB | rtfarm | Mitsuba / rtfarm |'
+              '\n|---|---|---|---|---|')
+        for name, scene in MESHES:
+            source = self.generated(scene)
+            for samples in (1, 16):
+                peer = self.mitsuba(source, samples)
+                own = self.whole(source, f'--samples {samples}')
                 memory = [peak_memory(command) for command in (peer, own)]
                 times = self.medians([peer, own])
                 cells = [f'{wall:.2f}, {processor:.2f}; {most:.0f}' for (wall, processor), most in zip(times, memory)]
                 ratios = [a / b for a, b in zip([*times[0], memory[0]], [*times[1], memory[1]])]
                 print(f'| {name} | {samples} | {cells[0]} | {cells[1]} '
                       f'| {ratios[0]:.2f}, {ratios[1]:.2f}; {ratios[2]:.1f} |', flush=True)
+        print()
+
+    def equal(self):
+        """To a root mean square error of one step of 8 bits, both pictures in 8 bits."""
+        print('| 1280 x 720 | Mitsuba: samples, error; wall, processor s | rtfarm: samples, error; wall, processor s '
+              '| Mitsuba / rtfarm | `--error`, error; wall, processor s | Mitsuba / rtfarm |\n|---|---|---|---|---|---|')
+        path = {program: self.picture(program, 'mesh') for program in ('mitsuba', 'rtfarm')}
+
+        def first_within(program, truth, ladder, command):
+            for step in ladder:
+                found = command(step)
+                run(found)
+                if (missed := error(read_png(path[program]), truth)) <= 1:
+                    break
+            return step, missed, found
+
+        for name, scene in MESHES:
+            source = self.generated(scene)
+            run(self.mitsuba(source, 1024, 'multijitter'))
+            truth = read_png(path['mitsuba'])
+            squares = [1, 4, 9, 16, 25, 36, 64, 100, 144, 256, 400, 576]
+            found = [first_within('mitsuba', truth, squares, lambda n: self.mitsuba(source, n, 'multijitter'))]
+            run(self.whole(source, '--samples 1024'))
+            truth = read_png(path['rtfarm'])
+            counts = [1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 128, 256]
+            found += [first_within('rtfarm', truth, counts, lambda n: self.whole(source, f'--samples {n}')),
+                      first_within('rtfarm', truth, ERRORS, lambda level: self.whole(source, f'--error {level}'))]
+            times = self.medians([command for _, _, command in found])
+            steps = [str(step) for step, _, _ in found[:2]] + [f'{255 * float(found[2][0]):.2g}/255']
+            cells = [f'{step}, {missed:.2f}; {wall:.2f}, {processor:.2f}'
+                     for step, (_, missed, _), (wall, processor) in zip(steps, found, times)]
+            ratios = [f'{times[0][0] / wall:.2f}, {times[0][1] / processor:.2f}' for wall, processor in times[1:]]
+            print(f'| {name} | {cells[0]} | {cells[1]} | {ratios[0]} | {cells[2]} | {ratios[1]} |', flush=True)
         print()
 
     def same_samples(self):
@@ -235,14 +289,20 @@ def main():
     args.add_argument('rtfarm')
     args.add_argument('converters')
     args.add_argument('--runs', type=int, default=3)
-    args.add_argument('--only', choices=['meshes', 'same', 'adaptive'])
+    args.add_argument('--only', choices=['meshes', 'equal', 'same', 'adaptive'])
     args.add_argument('--quiet', default='', metavar='COMMAND')
     args = args.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         bench = Bench(args, folder)
-        if args.only in (None, 'meshes'):
-            bench.meshes()
-        if args.only == 'meshes':
+        if args.only in (None, 'meshes', 'equal'):
+            if subprocess.run([PYTHON, '-c', 'import mitsuba'], stderr=subprocess.DEVNULL).returncode:
+                skip('meshes: there is no Mitsuba in the Python of MITSUBA_PYTHON')
+            else:
+                if args.only != 'equal':
+                    bench.meshes()
+                if args.only != 'meshes':
+                    bench.equal()
+        if args.only in ('meshes', 'equal'):
             return
         if not shutil.which('povray'):
             return skip('solids: there is no povray')

@@ -3,7 +3,7 @@
 use hashbrown::{HashTable, hash_table::Entry};
 use rayon::prelude::*;
 
-use super::hash::HashFunction;
+use super::hash::{HashFunction, Repeated};
 
 /// The bits of a point's coordinates. Points are in one place where all their bits are equal, so
 /// zeros of either sign are two places.
@@ -68,17 +68,22 @@ impl PointTable {
 
 /// For every point, the first point in the same place, on rayon's threads.
 pub(crate) fn find_firsts<P: Sync>(points: &[P], bits_of: fn(&P) -> PointBits) -> Vec<u32> {
+    let hasher = PointHasher::new();
+    let hashes = || points.par_iter().map(|point| hasher.hash(bits_of(point)));
+    let repeated = Repeated::new(points.len(), hashes());
+    let points_of_hashes: Vec<(u64, u32)> = (hashes().zip(0..points.len() as u32))
+        .filter(|&(hash, _)| repeated.may_have(hash))
+        .collect();
     // Each thread keeps the points of one share of all hashes; a point's share depends on its
     // coordinates alone, so the answer does not depend on the number of shares.
-    let shares = if points.len() < 1 << 14 { 1 } else { rayon::current_num_threads() };
-    let hasher = PointHasher::new();
-    let hashes: Vec<u64> = points.par_iter().map(|point| hasher.hash(bits_of(point))).collect();
+    let count = points_of_hashes.len();
+    let shares = if count < 1 << 14 { 1 } else { rayon::current_num_threads() };
     let copies: Vec<Vec<(u32, u32)>> = (0..shares)
         .into_par_iter()
         .map(|share| {
-            let mut table = PointTable::new(hasher.clone(), points.len() / shares);
+            let mut table = PointTable::new(hasher.clone(), count / shares);
             let mut copies = Vec::new();
-            for (point, &hash) in (0_u32..).zip(&hashes) {
+            for &(hash, point) in &points_of_hashes {
                 if (hash >> 32) as usize % shares != share {
                     continue;
                 }
@@ -93,7 +98,7 @@ pub(crate) fn find_firsts<P: Sync>(points: &[P], bits_of: fn(&P) -> PointBits) -
             copies
         })
         .collect();
-    let mut firsts: Vec<u32> = (0..points.len() as u32).collect();
+    let mut firsts: Vec<u32> = (0..points.len() as u32).into_par_iter().collect();
     for (copy, first) in copies.into_iter().flatten() {
         firsts[copy as usize] = first;
     }

@@ -46,6 +46,11 @@ impl Bounds {
         Self { min: self.min.min(other.min), max: self.max.max(other.max) }
     }
 
+    #[inline(always)]
+    fn add(&mut self, point: Vec4) {
+        *self = Self { min: self.min.min(point), max: self.max.max(point) };
+    }
+
     /// Half the surface.
     #[inline(always)]
     fn half_area(&self) -> f32 {
@@ -124,14 +129,36 @@ impl<'a> BuildRange<'a> {
 
     /// Splits in two where it is cheapest.
     fn split(self, level: usize) -> [Self; 2] {
-        let split = if level < MEDIAN_LEVEL { self.cheapest_split() } else { None };
-        let at = match split {
-            Some(split) => split.partition(self.primitives),
-            None => self.primitives.len() / 2, // Nothing tells them apart.
+        let split = match level {
+            MEDIAN_LEVEL.. => None,
+            _ if self.primitives.len() <= FEW => self.cheapest_split::<{ BINS / 2 }>(),
+            _ => self.cheapest_split::<BINS>(),
         };
-        let (left, right) = self.primitives.split_at_mut(at);
-        let range = |half, first| BuildRange::new(half, first, self.leaves);
-        [range(left, self.first), range(right, self.first + at)]
+        let Self { primitives, first, leaves, .. } = self;
+        match split {
+            Some(split) => {
+                let (at, centers) = split.partition(primitives);
+                let [left, right] = split.sides;
+                let (before, behind) = primitives.split_at_mut(at);
+                let range = |primitives, first, bounds, centers| Self {
+                    primitives,
+                    first,
+                    bounds,
+                    centers,
+                    leaves,
+                };
+                [
+                    range(before, first, left, centers[0]),
+                    range(behind, first + at, right, centers[1]),
+                ]
+            }
+            // Nothing tells them apart.
+            None => {
+                let at = primitives.len() / 2;
+                let (before, behind) = primitives.split_at_mut(at);
+                [Self::new(before, first, leaves), Self::new(behind, first + at, leaves)]
+            }
+        }
     }
 
     /// The leaf, where the range is one.
@@ -147,44 +174,49 @@ impl<'a> BuildRange<'a> {
 
     /// The split between two bins with the least area x count on its sides; `None` where the
     /// centres do not differ enough for bins.
-    fn cheapest_split(&self) -> Option<Split> {
-        let count = if self.primitives.len() > FEW { BINS } else { BINS / 2 };
+    fn cheapest_split<const COUNT: usize>(&self) -> Option<Split> {
         let extent = (self.centers.max - self.centers.min).to_array();
         let mut scale = [0.0; 4];
         for axis in 0..3 {
-            let fitting = count as f32 * (1.0 - f32::EPSILON) / extent[axis];
+            let fitting = COUNT as f32 * (1.0 - f32::EPSILON) / extent[axis];
             if extent[axis] > 0.0 && fitting.is_finite() {
                 scale[axis] = fitting;
             }
         }
-        let binning = Binning { low: self.centers.min, scale: Vec4::from_array(scale) };
+        let scales = Vec4::from_array(scale);
+        let binning = Binning { low: self.centers.min, scale: scales, last: COUNT - 1 };
         let bins = if self.primitives.len() > 8 * SERIAL {
             self.primitives
                 .par_chunks(SERIAL)
-                .map(|chunk| binning.fill(chunk))
+                .map(|chunk| binning.fill::<COUNT>(chunk))
                 .reduce_with(|a, b| merge_bins(&a, &b))?
         } else {
             binning.fill(self.primitives)
         };
-        let mut best: Option<Split> = None;
+        // The cheapest: cost, axis and bin.
+        let mut best: Option<(f32, usize, usize)> = None;
         for axis in (0..3).filter(|&axis| scale[axis] > 0.0) {
-            let mut right_cost = [0.0; BINS];
+            let mut right_cost = [0.0; COUNT];
             let mut side = Bin::EMPTY;
-            for bin in (1..count).rev() {
+            for bin in (1..COUNT).rev() {
                 side = side.join(&bins[axis][bin]);
                 right_cost[bin] = side.bounds.half_area() * side.count as f32;
             }
             side = Bin::EMPTY;
-            for bin in 1..count {
+            for bin in 1..COUNT {
                 side = side.join(&bins[axis][bin - 1]);
                 let cost = side.bounds.half_area() * side.count as f32 + right_cost[bin];
                 let is_split = side.count > 0 && (side.count as usize) < self.primitives.len();
-                if is_split && best.as_ref().is_none_or(|best| cost < best.cost) {
-                    best = Some(Split { axis, bin, cost, binning });
+                if is_split && best.is_none_or(|best| cost < best.0) {
+                    best = Some((cost, axis, bin));
                 }
             }
         }
-        best
+        let (_, axis, bin) = best?;
+        let join =
+            |bins: &[Bin]| bins.iter().fold(Bounds::NONE, |bounds, bin| bounds.join(&bin.bounds));
+        let (left, right) = bins[axis].split_at(bin);
+        Some(Split { axis, bin, sides: [join(left), join(right)], binning })
     }
 }
 
@@ -192,6 +224,8 @@ impl<'a> BuildRange<'a> {
 struct Binning {
     low: Vec4,
     scale: Vec4,
+    /// The number of the last bin, all ones in binary.
+    last: usize,
 }
 
 #[derive(Clone, Copy)]
@@ -203,7 +237,8 @@ struct Bin {
 struct Split {
     axis: usize,
     bin: usize,
-    cost: f32,
+    /// What is on each side.
+    sides: [Bounds; 2],
     binning: Binning,
 }
 
@@ -215,7 +250,10 @@ impl Bin {
     }
 }
 
-fn merge_bins(a: &[[Bin; BINS]; 3], b: &[[Bin; BINS]; 3]) -> [[Bin; BINS]; 3] {
+fn merge_bins<const COUNT: usize>(
+    a: &[[Bin; COUNT]; 3],
+    b: &[[Bin; COUNT]; 3],
+) -> [[Bin; COUNT]; 3] {
     std::array::from_fn(|axis| std::array::from_fn(|bin| a[axis][bin].join(&b[axis][bin])))
 }
 
@@ -227,14 +265,14 @@ impl Binning {
         const ONES: f32 = (3 << 22) as f32;
         let at = (bounds.twice_center() - self.low) * self.scale;
         let [x, y, z, _] = (at - 0.5 + ONES).to_array();
-        [x, y, z].map(|x| x.to_bits() as usize % BINS)
+        [x, y, z].map(|x| x.to_bits() as usize & self.last)
     }
 
-    fn fill(&self, primitives: &[BuildPrimitive]) -> [[Bin; BINS]; 3] {
-        let mut bins = [[Bin::EMPTY; BINS]; 3];
+    fn fill<const COUNT: usize>(&self, primitives: &[BuildPrimitive]) -> [[Bin; COUNT]; 3] {
+        let mut bins = [[Bin::EMPTY; COUNT]; 3];
         for BuildPrimitive(bounds) in primitives {
             for (bins, bin) in bins.iter_mut().zip(self.bins(bounds)) {
-                let bin = &mut bins[bin];
+                let bin = &mut bins[bin % COUNT];
                 bin.bounds = bin.bounds.join(bounds);
                 bin.count += 1;
             }
@@ -244,20 +282,24 @@ impl Binning {
 }
 
 impl Split {
-    /// Brings those left of the split to the front; returns how many they are.
-    fn partition(&self, primitives: &mut [BuildPrimitive]) -> usize {
+    /// Brings those left of the split to the front; returns how many they are, and the bounds of twice
+    /// the centres on each side.
+    fn partition(&self, primitives: &mut [BuildPrimitive]) -> (usize, [Bounds; 2]) {
         let is_left =
             |primitive: &BuildPrimitive| self.binning.bins(&primitive.0)[self.axis] < self.bin;
+        let [mut before, mut behind] = [Bounds::NONE; 2];
         let (mut left, mut right) = (0, primitives.len());
         loop {
             while left < right && is_left(&primitives[left]) {
+                before.add(primitives[left].0.twice_center());
                 left += 1;
             }
             while left < right && !is_left(&primitives[right - 1]) {
+                behind.add(primitives[right - 1].0.twice_center());
                 right -= 1;
             }
             if left >= right {
-                return left;
+                return (left, [before, behind]);
             }
             primitives.swap(left, right - 1);
         }
@@ -315,7 +357,7 @@ fn build_node(range: BuildRange<'_>, level: usize, nodes: &mut Vec<Node>) {
             Ok(subtree) => {
                 let offset = nodes.len();
                 nodes[own].children[k] = Child::inner(offset);
-                nodes.extend(subtree.into_iter().map(|mut node| {
+                nodes.par_extend(subtree.into_par_iter().with_min_len(SERIAL).map(|mut node| {
                     node.children = node.children.map(|child| child.moved_by(offset));
                     node
                 }));

@@ -36,7 +36,7 @@ impl Hierarchy {
         let most = if form == Form::Compact { Child::MOST_ITEMS } else { FEW };
         let first_solid = surfaces.flat.item_count() + surfaces.spheres.len();
         let nodes = build_bvh(&mut primitives, Leaves { most, alone_from: first_solid as u32 });
-        let order = primitives.into_iter().map(|primitive| primitive.item()).collect();
+        let order = primitives.par_iter().map(BuildPrimitive::item).collect();
         Self { frame, nodes, order }
     }
 }
@@ -44,14 +44,13 @@ impl Hierarchy {
 /// The frame around everything.
 fn frame_around(surfaces: &Surfaces) -> Frame {
     let flat = &surfaces.flat;
-    let points = flat.corners[..flat.item_corner_count()].iter().map(|&corner| {
+    let none = (DVec3::INFINITY, DVec3::NEG_INFINITY);
+    let join = |a: (DVec3, DVec3), b: (DVec3, DVec3)| (a.0.min(b.0), a.1.max(b.1));
+    let points = flat.corners[..flat.item_corner_count()].par_iter().map(|&corner| {
         let point = flat.points[corner as usize];
         (point, point)
     });
-    let (mut min, mut max) = (DVec3::INFINITY, DVec3::NEG_INFINITY);
-    for (low, high) in points.chain(round_bounds(surfaces)) {
-        (min, max) = (min.min(low), max.max(high));
-    }
+    let (min, max) = round_bounds(surfaces).fold(points.reduce(|| none, join), join);
     if min.x > max.x {
         return Frame { origin: [0.0; 3], scale: 1.0 };
     }
@@ -86,10 +85,10 @@ fn build_primitives(surfaces: &Surfaces, frame: &Frame) -> Vec<BuildPrimitive> {
             item,
         )
     };
-    let mut primitives: Vec<BuildPrimitive> = (0..flat.item_count())
-        .into_par_iter()
-        .map(|face| primitive(bounds_of(&flat.corners_of(face)), face as u32))
-        .collect();
+    let round_count = surfaces.spheres.len() + surfaces.solids.len();
+    let mut primitives = Vec::with_capacity(flat.item_count() + round_count);
+    let of_face = |face: usize| primitive(bounds_of(&flat.corners_of(face)), face as u32);
+    primitives.par_extend((0..flat.item_count()).into_par_iter().map(of_face));
     let round = round_bounds(surfaces).zip(flat.item_count() as u32..);
     primitives.extend(round.map(|(round, item)| primitive(round, item)));
     primitives

@@ -135,6 +135,17 @@ pub fn prepare_with(
     Ok(assemble(camera(&viewport, scale), lighting, frame, scale, features, &sections))
 }
 
+/// What builds the hierarchy of a scene, and that alone, for benchmarks; it tells how many nodes there
+/// are.
+#[doc(hidden)]
+pub fn hierarchy_of(scene: &Scene) -> Result<impl Fn() -> usize, PrepareError> {
+    let viewport = scene.viewport.ok_or(PrepareError::NoViewport)?;
+    let ranks = Ranks::new(scene)?;
+    let scaled = Collected::new(scene, &ranks).scale(extent_of_eye_and_lights(scene, &viewport));
+    let surfaces = scaled.weld().share_surfaces(&ranks);
+    Ok(move || Hierarchy::new(&surfaces, Form::Fast).nodes.len())
+}
+
 /// The eye and the screen in the units of the prepared scene.
 fn camera(viewport: &Viewport, scale: f64) -> Camera {
     let [eye, top_left, bottom_left, top_right] =

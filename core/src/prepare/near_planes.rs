@@ -105,7 +105,7 @@ fn meeting_others(flat: &FlatFaces, ranks: &Ranks) -> Vec<u32> {
     }
     for ((run, _), others) in large.into_iter().zip(others) {
         let meets = |&face: &usize| !is_apart(bounds(face), others);
-        small.extend(run.filter(meets).map(|face| face as u32));
+        small.par_extend(run.into_par_iter().filter(meets).map(|face| face as u32));
     }
     small
 }

@@ -12,7 +12,7 @@ use super::{
     flat::FlatFaces, near_planes::near_sets, plane_fingerprint::plane_fingerprints, ranks::Ranks,
 };
 use crate::{
-    exact::predicates::is_coplanar,
+    exact::{hash::Repeated, predicates::is_coplanar},
     prepared::record::{PlaneIndex, PlaneRecord},
 };
 
@@ -64,14 +64,16 @@ impl Sharing<'_> {
                 _ => [corners[0], corners[1], corners[2]],
             }
         });
+        let prints = fingerprints.par_iter().filter_map(|&print| print);
+        let repeated = Repeated::new(fingerprints.len(), prints);
         let mut by_plane: Vec<(u64, u32, u32)> = fingerprints
             .into_par_iter()
             .enumerate()
-            .filter(|&(face, _)| match *flat.corners_of(face) {
-                [a, b, c, d] => is_coplanar(a, b, c, d),
-                _ => true,
-            })
             .filter_map(|(face, print)| Some((print?, flat.rank(face), face as u32)))
+            .filter(|&(print, _, face)| match *flat.corners_of(face as usize) {
+                [a, b, c, d] => is_coplanar(a, b, c, d),
+                _ => repeated.may_have(print),
+            })
             .collect();
         by_plane.par_sort_unstable();
         let groups: Vec<&[(u64, u32, u32)]> = by_plane

@@ -1,6 +1,9 @@
 //! The sixth step: records in the order of the hierarchy's leaves.
 
-use std::collections::HashMap;
+use std::{
+    collections::HashMap,
+    sync::atomic::{AtomicU32, Ordering},
+};
 
 use glam::DVec3;
 use rayon::prelude::*;
@@ -58,79 +61,111 @@ impl Sorted {
     }
 }
 
-/// The corners of so many faces are gathered on all threads before these are numbered.
-const GATHERED_AT_ONCE: usize = 1 << 14;
-
 impl FlatFaces {
-    /// The points of the corners of an item, of three or four, and its attributes; `None` if it is not
-    /// flat.
-    fn gather(&self, item: usize) -> Option<([u32; 4], FaceAttributes)> {
-        (item < self.item_count()).then(|| {
-            let mut corners = [0; 4];
-            let range = self.corner_range(item);
-            corners[..range.len()].copy_from_slice(&self.corners[range]);
-            (corners, self.attributes[item])
-        })
+    /// The points of the corners of an item, of three or four, which are none for one that is not flat.
+    fn gather(&self, item: usize) -> &[u32] {
+        if item < self.item_count() { &self.corners[self.corner_range(item)] } else { &[] }
+    }
+
+    /// Numbers points in the order in which items come to them: the points in that order, and the number
+    /// of each.
+    fn number_points(&self, order: &[u32]) -> (Vec<u32>, Vec<AtomicU32>) {
+        // The place of the corner that comes to each point first, then its number.
+        let none = || AtomicU32::new(u32::MAX);
+        let numbers: Vec<AtomicU32> =
+            (0..self.points.len()).into_par_iter().map(|_| none()).collect();
+        let places = |place: usize, item: u32| (4 * place as u32..).zip(self.gather(item as usize));
+        order.par_iter().enumerate().for_each(|(place, &item)| {
+            for (corner, &point) in places(place, item) {
+                numbers[point as usize].fetch_min(corner, Ordering::Relaxed);
+            }
+        });
+        let of_runs: Vec<Vec<u32>> = (order.par_chunks(NUMBERED_AT_ONCE).enumerate())
+            .map(|(run, items)| {
+                let mut points = Vec::new();
+                for (place, &item) in (run * NUMBERED_AT_ONCE..).zip(items) {
+                    let is_first = |&(corner, point): &(u32, &u32)| {
+                        numbers[*point as usize].load(Ordering::Relaxed) == corner
+                    };
+                    points.extend(places(place, item).filter(is_first).map(|(_, &point)| point));
+                }
+                points
+            })
+            .collect();
+        let points = of_runs.concat();
+        points.par_iter().zip(0..points.len() as u32).for_each(|(&point, number)| {
+            numbers[point as usize].store(number, Ordering::Relaxed);
+        });
+        (points, numbers)
     }
 }
+
+/// A thread looks for new points in so many items in one go.
+const NUMBERED_AT_ONCE: usize = 1 << 13;
 
 impl Surfaces {
     /// Makes the records of all items, in this order of their numbers.
     pub(super) fn sort(self, order: &[u32]) -> Sorted {
         let Self { flat, solids: solids_in_file_order, .. } = self;
-        let mut faces = Vec::with_capacity(order.len());
-        // The points of the vertices.
-        let mut points = Vec::with_capacity(flat.points.len());
-        let mut coats = Vec::new();
-        let mut coat_places = HashMap::new();
-        let mut quadrangles = Vec::new();
-        let mut spheres = Vec::new();
-        let mut solids = Vec::new();
-        let mut numbers = vec![u32::MAX; flat.points.len()];
-        let mut gathered = Vec::new();
-        for (place, &item) in order.iter().enumerate() {
+        let (points, numbers) = flat.number_points(order);
+        let vertices_of = |item: u32| {
+            let mut vertices = [0; 4];
+            for (vertex, &point) in vertices.iter_mut().zip(flat.gather(item as usize)) {
+                *vertex = numbers[point as usize].load(Ordering::Relaxed);
+            }
+            vertices
+        };
+        let first_round = flat.item_count();
+        let first_solid = first_round + self.spheres.len();
+        // Whole records of triangles that are alone in their planes; of other items the kind.
+        let record = |&item: &u32| {
             let face = item as usize;
-            if place % GATHERED_AT_ONCE == 0 {
-                let run = &order[place..order.len().min(place + GATHERED_AT_ONCE)];
-                run.par_iter()
-                    .map(|&item| flat.gather(item as usize))
-                    .collect_into_vec(&mut gathered);
-            }
-            let Some((mut corners, attributes)) = gathered[place % GATHERED_AT_ONCE] else {
-                let round = face - flat.item_count();
-                if let Some(&sphere) = self.spheres.get(round) {
-                    faces.push(FaceRecord::of(Kind::Sphere, spheres.len()));
-                    spheres.push(sphere);
-                } else {
-                    faces.push(FaceRecord::of(Kind::Solid, solids.len()));
-                    solids.push(solids_in_file_order[round - self.spheres.len()]);
+            if face < flat.triangle_count {
+                let [a, b, c, _] = vertices_of(item);
+                let FaceAttributes { material, rank } = flat.attributes[face];
+                match self.triangle_planes[face] {
+                    None => FaceRecord::triangle([a, b, c], material, rank),
+                    Some(_) => FaceRecord::coplanar([a, b, c], 0, rank),
                 }
-                continue;
-            };
-            let is_quadrangle = face >= flat.triangle_count;
-            for corner in &mut corners[..3 + usize::from(is_quadrangle)] {
-                let number = &mut numbers[*corner as usize];
-                if *number == u32::MAX {
-                    *number = points.len() as u32;
-                    points.push(*corner);
-                }
-                *corner = *number;
-            }
-            let FaceAttributes { material, rank } = attributes;
-            let [a, b, c, _] = corners;
-            if let Some(quadrangle) = face.checked_sub(flat.triangle_count) {
-                let plane = self.quadrangle_planes[quadrangle];
-                faces.push(FaceRecord::of(Kind::Quadrangle, quadrangles.len()));
-                quadrangles.push(QuadrangleRecord::new(corners, material, rank, plane));
-            } else if let Some(plane) = self.triangle_planes[face] {
-                let coat = Coat { plane, material };
-                let place = *coat_places.entry(coat).or_insert_with(|| {
-                    coats.push(coat);
-                    coats.len() as u32 - 1
-                });
-                faces.push(FaceRecord::coplanar([a, b, c], place, rank));
+            } else if face < first_round {
+                FaceRecord::of(Kind::Quadrangle, 0)
+            } else if face < first_solid {
+                FaceRecord::of(Kind::Sphere, 0)
             } else {
-                faces.push(FaceRecord::triangle([a, b, c], material, rank));
+                FaceRecord::of(Kind::Solid, 0)
+            }
+        };
+        let mut faces: Vec<FaceRecord> = order.par_iter().map(record).collect();
+        let (mut coats, mut coat_places) = (Vec::new(), HashMap::new());
+        let (mut quadrangles, mut spheres, mut solids) = (Vec::new(), Vec::new(), Vec::new());
+        for (record, &item) in faces.iter_mut().zip(order) {
+            let face = item as usize;
+            match record.item(0).kind().expect("it was made above") {
+                Kind::Triangle => {}
+                Kind::Coplanar => {
+                    let plane = self.triangle_planes[face].expect("it shares its plane");
+                    let coat = Coat { plane, material: flat.attributes[face].material };
+                    let place = *coat_places.entry(coat).or_insert_with(|| {
+                        coats.push(coat);
+                        coats.len() as u32 - 1
+                    });
+                    *record = FaceRecord::coplanar(record.vertices, place, record.rank());
+                }
+                kind @ Kind::Quadrangle => {
+                    *record = FaceRecord::of(kind, quadrangles.len());
+                    let FaceAttributes { material, rank } = flat.attributes[face];
+                    let plane = self.quadrangle_planes[face - flat.triangle_count];
+                    let vertices = vertices_of(item);
+                    quadrangles.push(QuadrangleRecord::new(vertices, material, rank, plane));
+                }
+                kind @ Kind::Sphere => {
+                    *record = FaceRecord::of(kind, spheres.len());
+                    spheres.push(self.spheres[face - first_round]);
+                }
+                kind @ Kind::Solid => {
+                    *record = FaceRecord::of(kind, solids.len());
+                    solids.push(solids_in_file_order[face - first_solid]);
+                }
             }
         }
         let vertices =

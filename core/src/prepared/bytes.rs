@@ -33,9 +33,23 @@ struct Line([u8; 64]);
 impl PreparedBytes {
     /// Bytes that came from elsewhere, brought into alignment.
     pub fn copy_from(bytes: &[u8]) -> Self {
-        let mut block = Self::zeroed(bytes.len());
-        block.bytes_mut().copy_from_slice(bytes);
-        block
+        let mut lines = Vec::new();
+        push_bytes(&mut lines, bytes);
+        Self { lines, length: bytes.len() }
+    }
+
+    /// Bytes that `read` puts into places, of which it is told where among all `length` they begin; it is
+    /// called on rayon's threads.
+    pub fn read<E: Send>(
+        length: usize,
+        read: impl Fn(&mut [u8], usize) -> Result<(), E> + Sync,
+    ) -> Result<Self, E> {
+        let empty = (0..length.div_ceil(64)).into_par_iter().with_min_len(COPIED_AT_ONCE);
+        let mut block = Self { lines: empty.map(|_| Line([0; 64])).collect(), length };
+        let piece = 64 * COPIED_AT_ONCE;
+        let pieces = block.bytes_mut().par_chunks_mut(piece).enumerate();
+        pieces.try_for_each(|(k, place)| read(place, k * piece))?;
+        Ok(block)
     }
 
     /// The scene's address.
@@ -44,11 +58,7 @@ impl PreparedBytes {
         SceneHash(header.hash)
     }
 
-    pub(super) fn zeroed(length: usize) -> Self {
-        Self { lines: bytemuck::zeroed_vec(length.div_ceil(64)), length }
-    }
-
-    pub(super) fn bytes_mut(&mut self) -> &mut [u8] {
+    fn bytes_mut(&mut self) -> &mut [u8] {
         &mut bytemuck::cast_slice_mut(&mut self.lines)[..self.length]
     }
 }
@@ -59,8 +69,19 @@ impl AsRef<[u8]> for PreparedBytes {
     }
 }
 
-/// A thread copies so many bytes in one go.
-const COPIED_AT_ONCE: usize = 1 << 20;
+/// A thread copies at least so many lines in one go.
+const COPIED_AT_ONCE: usize = 1 << 13;
+
+/// Adds bytes, and zeros to the end of a line, on rayon's threads: each clears and fills pages of its own.
+fn push_bytes(lines: &mut Vec<Line>, bytes: &[u8]) {
+    let (whole, rest) = bytes.as_chunks();
+    lines.par_extend(whole.par_iter().with_min_len(COPIED_AT_ONCE).map(|&line| Line(line)));
+    if !rest.is_empty() {
+        let mut last = [0; 64];
+        last[..rest.len()].copy_from_slice(rest);
+        lines.push(Line(last));
+    }
+}
 
 /// Lays the parts of a prepared scene out as one block.
 pub(crate) fn assemble(
@@ -90,14 +111,13 @@ pub(crate) fn assemble(
             Section { offset: offset as u64, count: (section.len() / RECORD_SIZES[k]) as u64 };
         end = offset + section.len();
     }
-    let mut block = PreparedBytes::zeroed(end);
-    let bytes = block.bytes_mut();
-    for (section, place) in sections.iter().zip(&header.sections) {
-        let copy = &mut bytes[place.offset as usize..][..section.len()];
-        let pieces = copy.par_chunks_mut(COPIED_AT_ONCE).zip(section.par_chunks(COPIED_AT_ONCE));
-        pieces.for_each(|(copy, piece)| copy.copy_from_slice(piece));
+    let mut lines = Vec::with_capacity(end.div_ceil(64));
+    push_bytes(&mut lines, bytemuck::bytes_of(&header));
+    for section in sections {
+        push_bytes(&mut lines, section);
     }
-    bytes[..size_of::<Header>()].copy_from_slice(bytemuck::bytes_of(&header));
+    let mut block = PreparedBytes { lines, length: end };
+    let bytes = block.bytes_mut();
     let hash = content_hash(&bytes[HASHED_FROM..]);
     bytes[HASHED_FROM - 32..HASHED_FROM].copy_from_slice(hash.as_bytes());
     block

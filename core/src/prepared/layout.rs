@@ -201,6 +201,19 @@ impl<'a> View<'a> {
         [f64::from(x), f64::from(y), f64::from(z)]
     }
 
+    /// The position of a vertex where it stands; one in single precision is written into `room`.
+    #[inline(always)]
+    pub(crate) fn vertex_in<'n>(&self, vertex: u32, room: &'n mut [f64; 3]) -> &'n [f64; 3]
+    where
+        'a: 'n,
+    {
+        if let Some(vertex) = self.sections.vertices.get(vertex as usize) {
+            return vertex;
+        }
+        *room = self.vertex(vertex);
+        room
+    }
+
     /// The positions of vertices. This is a loop, as `Shear::project_all` is.
     #[inline(always)]
     pub(crate) fn corners<const N: usize>(&self, vertices: &[u32; N]) -> [[f64; 3]; N] {

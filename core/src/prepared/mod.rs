@@ -18,9 +18,8 @@ pub use bytes::{PreparedBytes, SceneHash};
 #[doc(hidden)]
 pub use layout::SECTION_NAMES;
 
-use self::layout::{BYTE_ORDER, HASHED_FROM, MAGIC, RECORD_SIZES, Sections, VERSION, View};
-
-use self::layout::Header;
+use self::layout::{BYTE_ORDER, HASHED_FROM, Header, MAGIC, RECORD_SIZES, Sections, VERSION, View};
+use crate::exact::hash::content_hash;
 
 /// Why bytes are no prepared scene.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
@@ -45,13 +44,25 @@ pub struct PreparedScene<B> {
 impl<B: AsRef<[u8]>> PreparedScene<B> {
     /// Checks `bytes`, which must be aligned to 64 (as [`PreparedBytes`] and memory maps are), and
     /// makes them usable. No bytes whatever can make a later reader go out of bounds, loop or meet
-    /// a NaN.
+    /// a NaN. Their hash is made on rayon's threads.
     pub fn open(bytes: B) -> Result<Self, PreparedError> {
-        Self::open_in_steps(bytes, &mut || ())
+        Self::open_by(bytes, content_hash)
     }
 
-    /// [`PreparedScene::open`], calling `on_step` after every 16 MiB, some 10 ms of work.
+    /// [`PreparedScene::open`] on this thread alone, calling `on_step` after every 16 MiB, some 10 ms of
+    /// work.
     pub fn open_in_steps(bytes: B, on_step: &mut dyn FnMut()) -> Result<Self, PreparedError> {
+        Self::open_by(bytes, |data| {
+            let mut hasher = blake3::Hasher::new();
+            for step in data.chunks(1 << 24) {
+                hasher.update(step);
+                on_step();
+            }
+            hasher.finalize()
+        })
+    }
+
+    fn open_by(bytes: B, hash: impl FnOnce(&[u8]) -> blake3::Hash) -> Result<Self, PreparedError> {
         let data = bytes.as_ref();
         let header = data.get(..size_of::<Header>()).ok_or(PreparedError::Foreign("too short"))?;
         let header: &Header = bytemuck::try_from_bytes(header)
@@ -59,12 +70,7 @@ impl<B: AsRef<[u8]>> PreparedScene<B> {
         if header.magic != MAGIC || header.version != VERSION || header.byte_order != BYTE_ORDER {
             return Err(PreparedError::Foreign("another kind, version or byte order"));
         }
-        let mut hasher = blake3::Hasher::new();
-        for step in data[HASHED_FROM..].chunks(1 << 24) {
-            hasher.update(step);
-            on_step();
-        }
-        if hasher.finalize() != header.hash {
+        if hash(&data[HASHED_FROM..]) != header.hash {
             return Err(PreparedError::Damaged);
         }
         for (section, size) in header.sections.iter().zip(RECORD_SIZES) {
@@ -74,7 +80,6 @@ impl<B: AsRef<[u8]>> PreparedScene<B> {
                 return Err(PreparedError::Malformed("a section out of bounds"));
             }
         }
-        on_step();
         let scene = Self { bytes };
         check::check(&scene.view()).map_err(PreparedError::Malformed)?;
         Ok(scene)

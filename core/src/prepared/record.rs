@@ -196,7 +196,7 @@ impl FaceRecord {
 
     /// Whether it is a triangle, alone in its plane or not.
     #[inline(always)]
-    fn is_triangle(&self) -> bool {
+    pub(crate) fn is_triangle(&self) -> bool {
         self.kind_and_rank >> 29 <= Kind::Coplanar as u32
     }
 

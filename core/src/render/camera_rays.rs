@@ -4,8 +4,8 @@ use glam::DVec3;
 
 use crate::{
     prepared::record::{Camera, Surface},
-    sample::{AT_ONCE, Sample, positions},
-    tile::Size,
+    sample::{AT_ONCE, FEWEST_FOR_ERROR, Sample, Samples, positions},
+    tile::{Area, Size},
     trace::{kernels::LaneWork, ray::Ray},
 };
 
@@ -74,6 +74,35 @@ impl LaneWork for CameraRays<'_> {
                     targets.push(vector(&target));
                 }
             }
+        }
+    }
+}
+
+/// Finds where the first samples of pixels lie in the frame, in pixels.
+pub(super) struct FirstPlaces<'a> {
+    pub(super) area: Area,
+    pub(super) seed: u64,
+    /// The places, `[x, y]`, pixel by pixel.
+    pub(super) places: &'a mut Vec<[f64; 2]>,
+}
+
+impl LaneWork for FirstPlaces<'_> {
+    #[inline(always)]
+    fn run(&mut self) {
+        let first = |(x, y)| Samples::new(FEWEST_FOR_ERROR, self.seed, x, y).sample(0);
+        let mut pixels = self.area.pixels();
+        let mut left = self.area.pixel_count();
+        while left > 0 {
+            let mut of_lanes = [(0, 0); AT_ONCE];
+            let count = left.min(AT_ONCE);
+            for lane in &mut of_lanes[..count] {
+                *lane = pixels.next().expect("as many as the area has");
+            }
+            let [across, down] = positions(&of_lanes.map(first));
+            for (lane, (x, y)) in of_lanes.into_iter().enumerate().take(count) {
+                self.places.push([f64::from(x) + across[lane], f64::from(y) + down[lane]]);
+            }
+            left -= count;
         }
     }
 }

@@ -6,6 +6,7 @@
 //! samples. So a pixel is the same to the bit whatever the tile, the batch, the thread or the CPU.
 
 mod camera_rays;
+mod first_round;
 mod pixel;
 mod sampler;
 mod settings;

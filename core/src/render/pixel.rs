@@ -1,6 +1,6 @@
 //! A pixel on its way: the sums of its samples, and how far off their mean may be.
 
-use glam::{BVec3, DVec3};
+use glam::{BVec3, DVec3, FloatExt};
 
 use crate::{
     sample::{FEWEST_FOR_ERROR, RUNS},
@@ -56,6 +56,17 @@ impl Runs {
     }
 }
 
+/// What the first samples of a pixel and of its neighbours tell, channel by channel.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Around {
+    /// The variance of one sample; `None` where there are too few.
+    pub(super) variance: Option<DVec3>,
+    /// How far they lie apart.
+    pub(super) contrast: DVec3,
+    /// Where they tell an edge between two shades.
+    pub(super) is_edge: BVec3,
+}
+
 /// The first samples of a pixel and of its neighbours in the frame, one each, row by row.
 #[derive(Debug)]
 pub(super) struct Neighbourhood {
@@ -83,15 +94,20 @@ impl Neighbourhood {
         &self.colors[..self.width * self.height]
     }
 
+    /// What they tell.
+    pub(super) fn around(&self) -> Around {
+        Around { variance: self.variance(), contrast: self.contrast(), is_edge: self.is_edge() }
+    }
+
     /// How far the samples lie apart, channel by channel.
-    pub(super) fn contrast(&self) -> DVec3 {
+    fn contrast(&self) -> DVec3 {
         let colors = self.colors().iter().copied();
         let low = colors.clone().fold(DVec3::INFINITY, DVec3::min);
         colors.fold(DVec3::NEG_INFINITY, DVec3::max) - low
     }
 
     /// In which channels the samples tell an edge between two shades: all lie at either end of them.
-    pub(super) fn is_edge(&self) -> BVec3 {
+    fn is_edge(&self) -> BVec3 {
         let colors = self.colors().iter().copied();
         let low = colors.clone().fold(DVec3::INFINITY, DVec3::min);
         let contrast = self.contrast();
@@ -104,7 +120,7 @@ impl Neighbourhood {
     /// The variance of one sample, channel by channel, from how far the samples lie from the plane
     /// over the pixels' middles that fits them best. As each lies anywhere in its pixel, that is
     /// right for light that grows evenly as for noise. `None` where there are too few.
-    pub(super) fn variance(&self) -> Option<DVec3> {
+    fn variance(&self) -> Option<DVec3> {
         let freedom = (self.width * self.height)
             .checked_sub(1 + usize::from(self.width > 1) + usize::from(self.height > 1))
             .filter(|&freedom| freedom > 0)?;
@@ -145,16 +161,16 @@ pub(super) struct Pixel {
     squares: DVec3,
     /// The least and the largest sample, channel by channel.
     range: [DVec3; 2],
-    /// The variance of one sample and how far they lie apart, as the neighbourhood's first samples
-    /// tell it.
-    around: Option<DVec3>,
-    contrast_around: DVec3,
-    /// Where that is of an edge, channel by channel.
-    is_edge_around: BVec3,
+    /// What the neighbourhood's first samples tell.
+    around: Around,
     /// How far apart all samples lie that the pixel and its neighbours got first.
     contrast: DVec3,
     /// The variance that faces add which no sample has met.
     unseen: DVec3,
+    /// What such faces add in the decision to stop.
+    feared: DVec3,
+    /// The share of the pixel, 0..=1, of those that later samples met.
+    passed_share: f64,
     /// The noise of the pixels beside it, where that is alike.
     noise: Option<Noise>,
 }
@@ -188,7 +204,7 @@ const DECISION_OF_RUNS: f64 = 1.0 / 4.0;
 
 /// The share of the variance of a neighbourhood's first samples that their neighbours may hide: an
 /// edge that crosses a corner of a pixel, met by no first sample around.
-const HIDDEN: f64 = 1.0 / 128.0;
+pub(super) const HIDDEN: f64 = 1.0 / 128.0;
 
 /// What counts of a missed contrast in the error that is told, while decisions fear all of it: of the
 /// pixels that stay beside an edge it crosses some only. Later it also stands for what pixels hide that
@@ -204,10 +220,10 @@ const CROSSED_AT_FIRST: f64 = 0.3;
 const CROSSED_BY_EDGE: f64 = 0.6;
 
 /// Two shades lie this many times as far apart as what they differ in themselves, or more.
-const SHADES: f64 = 16.0;
+pub(super) const SHADES: f64 = 16.0;
 
 /// A channel is certainly above full light if its mean is by so many standard errors.
-const CERTAIN: f64 = 4.0;
+pub(super) const CERTAIN: f64 = 4.0;
 
 /// What a pixel is to come to.
 #[derive(Debug, Clone, Copy)]
@@ -218,24 +234,68 @@ pub(super) struct Wanted {
     pub(super) full_light: f64,
 }
 
+/// What covers less of a pixel is thin: few samples meet it, by chance more or less.
+const THIN_SHARE: f64 = 1.0 / 4.0;
+
+/// A thing that covers a small share of a pixel may have so many times the variance of one sample that
+/// is expected of it, where samples happened to meet it too often.
+const THIN: f64 = 3.0;
+
+/// As long as it is more probable than this that all samples miss a thing, what the mean lacks without it
+/// counts [`FEAR`] times.
+const MOST_MISSED: f64 = 1.0 / 7.0;
+const FEAR: f64 = 4.0;
+
+/// How probable it is that so many samples miss what covers this share of their pixel, 0..=1.
+pub(super) fn missed(share: f64, count: u32) -> f64 {
+    power(1.0 - share, count)
+}
+
+/// Raises `base` to a whole power by squaring.
+fn power(base: f64, exponent: u32) -> f64 {
+    let (mut product, mut square, mut left) = (1.0, base, exponent);
+    while left > 0 {
+        if left & 1 == 1 {
+            product *= square;
+        }
+        square *= square;
+        left >>= 1;
+    }
+    product
+}
+
+/// The variance that something adds in the decision to stop, whether samples met it or not: where pixels
+/// in which they did go on and others stop, light is lacking. It covers this share of the pixel, and the
+/// mean lacks so much if no sample meets it.
+pub(super) fn feared(share: f64, lack: DVec3, count: u32) -> DVec3 {
+    let (n, missed) = (f64::from(count), missed(share, count));
+    let expected = (EDGE / (n * n.sqrt())).lerp(1.0 / n, DECISION_OF_RUNS) * (1.0 - share) / share;
+    let feared = match share {
+        ..THIN_SHARE if missed > MOST_MISSED => FEAR,
+        ..THIN_SHARE => expected.max(missed).min(FEAR),
+        _ => missed,
+    };
+    lack * lack * feared
+}
+
 /// What a pixel shows of a contrast that runs evenly through its neighbourhood, as of a shade: a
 /// fourth. What is beyond that is unseen.
 const EVEN: f64 = 4.0;
 
 impl Pixel {
     /// A pixel whose first sample saw `color`.
-    pub(super) fn new(color: DVec3, neighbourhood: &Neighbourhood) -> Self {
+    pub(super) fn new(color: DVec3, around: Around) -> Self {
         let mut runs = Runs::default();
         runs.add(color);
         Self {
             runs,
             squares: color * color,
             range: [color; 2],
-            around: neighbourhood.variance(),
-            contrast_around: neighbourhood.contrast(),
-            is_edge_around: neighbourhood.is_edge(),
-            contrast: DVec3::ZERO,
+            around,
+            contrast: around.contrast,
             unseen: DVec3::ZERO,
+            feared: DVec3::ZERO,
+            passed_share: 0.0,
             noise: None,
         }
     }
@@ -285,9 +345,10 @@ impl Pixel {
         self.contrast = high - low;
     }
 
-    /// Notes the variance that faces add to the mean which no sample has met.
-    pub(super) fn set_unseen(&mut self, variance: DVec3) {
-        self.unseen = variance;
+    /// Notes what faces that the first sample missed add to the variance of the mean, and in the decision
+    /// to stop, and the share of the pixel, 0..=1, of those that later samples met.
+    pub(super) fn set_unseen(&mut self, variance: DVec3, feared: DVec3, passed_share: f64) {
+        (self.unseen, self.feared, self.passed_share) = (variance, feared, passed_share);
     }
 
     /// The mean of all samples and its variance. Of one sample the neighbourhood's first ones tell
@@ -297,9 +358,9 @@ impl Pixel {
         let missed = |crossed: f64| crossed * self.missed_variance();
         let variance = match self.runs.count {
             // Neighbours and faces tell of the same edge.
-            1 => self.around.map(|variance| {
+            1 => self.around.variance.map(|variance| {
                 let crossed = DVec3::splat(CROSSED_BY_EDGE);
-                let crossed = DVec3::select(self.is_edge_around, crossed, DVec3::ONE);
+                let crossed = DVec3::select(self.around.is_edge, crossed, DVec3::ONE);
                 (variance * crossed).max(self.unseen) + missed(CROSSED_AT_FIRST)
             }),
             n => self.runs.variance().map(|variance| {
@@ -314,13 +375,17 @@ impl Pixel {
 
     /// Whether the standard error is expected to be small enough in each channel: nearly that of
     /// an edge with the same samples, but runs that lie far apart keep the pixel open. In a common
-    /// noise the neighbours' samples tell both.
+    /// noise the neighbours' samples tell both, of thin things their share of the pixel.
     pub(super) fn is_done(&self, wanted: &Wanted) -> bool {
         let n = f64::from(self.runs.count);
+        let contrast = self.range[1] - self.range[0];
+        let of_thin = contrast * contrast * (self.passed_share * (1.0 - self.passed_share));
+        let of_one = self.variance_of_one();
         let of_samples = if self.runs.count == 1 {
-            self.around
+            self.around.variance
+        } else if self.is_thin() && of_one.cmple(THIN * of_thin).all() {
+            Some(DVec3::ZERO)
         } else {
-            let of_one = self.variance_of_one();
             let noise = self.noise.filter(|noise| of_one.cmple(ALIKE * noise.of_one).all());
             let (of_one, of_runs) = match noise {
                 Some(Noise { of_one, of_round }) => {
@@ -333,9 +398,15 @@ impl Pixel {
             of_runs.map(|of_runs| of_edge.lerp(of_runs, DECISION_OF_RUNS))
         };
         of_samples.is_some_and(|variance| {
-            let variance = variance + self.missed_variance() + self.unseen;
+            let passed = feared(self.passed_share, self.passed_share * contrast, self.runs.count);
+            let variance = variance + self.missed_variance() + self.feared + passed;
             self.unclipped(variance, wanted).max_element() < wanted.error * wanted.error
         })
+    }
+
+    /// Whether the faces that the first sample missed and later ones met are thin.
+    fn is_thin(&self) -> bool {
+        self.passed_share > 0.0 && self.passed_share < THIN_SHARE
     }
 
     /// The variance of one sample, channel by channel, from how far several lie apart.
@@ -352,7 +423,7 @@ impl Pixel {
             return variance;
         }
         let of_samples = match self.runs.count {
-            1 => self.around.unwrap_or(DVec3::INFINITY),
+            1 => self.around.variance.unwrap_or(DVec3::INFINITY),
             n => self.variance_of_one() / f64::from(n),
         };
         let spread = of_samples + self.missed_variance() + self.unseen;
@@ -364,7 +435,7 @@ impl Pixel {
     /// Whether the first samples of the neighbourhood lie so far apart that the pixels around may
     /// hide an edge worth more samples.
     pub(super) fn is_suspect(&self, wanted: &Wanted) -> bool {
-        self.around.is_none_or(|variance| {
+        self.around.variance.is_none_or(|variance| {
             let variance = self.unclipped(variance, wanted);
             HIDDEN * variance.max_element() > wanted.error * wanted.error
         })
@@ -373,7 +444,7 @@ impl Pixel {
     /// The variance that is added by what the neighbours met and this pixel did not yet.
     fn missed_variance(&self) -> DVec3 {
         let shown =
-            if self.runs.count == 1 { self.contrast_around } else { self.range[1] - self.range[0] };
+            if self.runs.count == 1 { self.around.contrast } else { self.range[1] - self.range[0] };
         let missed = (self.contrast - EVEN * shown).max(DVec3::ZERO);
         let n = f64::from(self.runs.count);
         missed * missed * (UNSEEN / (n * n * n))
@@ -398,13 +469,21 @@ mod tests {
     /// A pixel whose neighbours' first samples saw what its own did.
     fn pixel(first: f64, others: impl IntoIterator<Item = f64>) -> Pixel {
         let first = DVec3::splat(first);
-        let mut pixel = Pixel::new(first, &Neighbourhood::new(frame(3, 3), 1, 1, &[first; 9]));
+        let mut pixel =
+            Pixel::new(first, Neighbourhood::new(frame(3, 3), 1, 1, &[first; 9]).around());
         others.into_iter().for_each(|color| pixel.add(DVec3::splat(color)));
         pixel
     }
 
     fn wanted(error: f64) -> Wanted {
         Wanted { error, full_light: f64::INFINITY }
+    }
+
+    #[test]
+    fn a_power_is_a_product() {
+        assert_eq!(power(0.5, 0), 1.0);
+        assert_eq!(power(0.5, 13), 1.0 / 8192.0);
+        assert_eq!(power(0.0, 8), 0.0);
     }
 
     #[test]

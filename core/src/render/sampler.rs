@@ -6,10 +6,11 @@ use glam::DVec3;
 
 use super::{
     camera_rays::CameraSample,
-    pixel::{Estimate, Neighbourhood, Pixel, Runs, Wanted},
+    first_round::FirstRound,
+    pixel::{Estimate, Pixel, Runs, Wanted},
     settings::{Quality, Sampling},
     tally::Tally,
-    unseen::{FirstSample, UnseenFaces, UnseenSearch},
+    unseen::{FirstSamples, UnseenFaces, UnseenSearch},
     wavefront::Wavefront,
 };
 use crate::{
@@ -88,6 +89,7 @@ impl<'a> Sampler<'a> {
         let near = area.with_rim();
         let far = near.with_rim();
         let wide = far.with_rim();
+        let seed = self.quality.seed;
         let all = pixels_by_blocks(wide);
         let mut colors = vec![DVec3::ZERO; all.len()];
         let mut hits_by_blocks = Vec::with_capacity(all.len());
@@ -101,44 +103,63 @@ impl<'a> Sampler<'a> {
                 colors[all[place] as usize] = color;
             },
         )?;
-        let mut hits = hits_by_blocks.clone();
-        for (&pixel, hit) in all.iter().zip(hits_by_blocks) {
-            hits[pixel as usize] = hit;
-        }
-        let (flat, seed) = (self.quality.flat, self.quality.seed);
-        let mut search = UnseenSearch::new(self.view, area.frame(), flat, wanted.error, self.isa);
+        let mut search =
+            UnseenSearch::new(self.view, area.frame(), self.quality.flat, wanted.error, self.isa);
         let found = match &mut search {
-            Some(search) => self.find_unseen(search, area, wide, &colors, &hits)?,
+            Some(search) => {
+                let mut hits = hits_by_blocks.clone();
+                for (&pixel, hit) in all.iter().zip(hits_by_blocks) {
+                    hits[pixel as usize] = hit;
+                }
+                let firsts = FirstSamples::new(wide, seed, &colors, &hits, self.isa);
+                self.find_unseen(search, area, &firsts)?
+            }
             None => Vec::new(),
         };
-        drop(hits);
 
         // Where the first samples lie apart the pixels around get more, and what these see opens the
         // pixels beside them: an edge may cross a corner that no first sample met.
-        let new_pixel = |(x, y)| {
-            let first = colors[wide.index_of(x, y) as usize];
-            Pixel::new(first, &Neighbourhood::new(wide, x, y, &colors))
-        };
-        let mut pixels: Vec<Pixel> = far.pixels().map(new_pixel).collect();
-        drop(colors);
+        let round = FirstRound::new(far, wide, &colors, wanted, self.isa);
         let is_open = |&(x, y): &(u32, u32)| {
-            let mut around = neighbours(far, x, y).map(|index| &pixels[index as usize]);
-            !pixels[far.index_of(x, y) as usize].is_done(wanted)
-                || around.any(|pixel| pixel.is_suspect(wanted))
+            !round.verdicts[far.index_of(x, y) as usize].is_done
+                || far.neighbours(x, y).any(|pixel| round.verdicts[pixel as usize].is_suspect)
         };
-        let chosen: Vec<u32> =
-            near.pixels().filter(is_open).map(|(x, y)| far.index_of(x, y)).collect();
+        let new_pixel = |(x, y)| {
+            let around = round.around[far.index_of(x, y) as usize];
+            Pixel::new(colors[wide.index_of(x, y) as usize], around)
+        };
+        let mut chosen = Vec::new();
+        let mut pixels = Vec::new();
+        let mut place_of = vec![None; far.pixel_count()];
+        for (x, y) in near.pixels().filter(is_open) {
+            let index = far.index_of(x, y);
+            place_of[index as usize] = Some(pixels.len());
+            chosen.push(index);
+            pixels.push(new_pixel((x, y)));
+        }
         self.extend(far, &chosen, 1..FEWEST_FOR_ERROR, FEWEST_FOR_ERROR, None, |place, color| {
-            pixels[chosen[place] as usize].add(color);
+            pixels[place].add(color);
         })?;
+        let extended = |index: u32| place_of[index as usize].map(|place: usize| &pixels[place]);
         let mut found = found.into_iter().peekable();
         let mut estimates = Vec::with_capacity(area.pixel_count());
         let mut open = Vec::new();
         for (index, (x, y)) in (0..).zip(area.pixels()) {
-            let mut pixel = pixels[far.index_of(x, y) as usize];
-            let around = neighbours(far, x, y).map(|index| &pixels[index as usize]);
-            pixel.set_contrast(around.clone().map(Pixel::range));
-            pixel.set_noise(&around);
+            let around = far.neighbours(x, y);
+            let own = extended(far.index_of(x, y));
+            let mut pixel = own.copied().unwrap_or_else(|| new_pixel((x, y)));
+            // Where no neighbour has more than one sample their contrast is known.
+            if around.clone().any(|index| extended(index).is_some()) {
+                let first = |index| {
+                    let (x, y) = far.pixel_at(index);
+                    [colors[wide.index_of(x, y) as usize]; 2]
+                };
+                let range = |index| extended(index).map_or_else(|| first(index), Pixel::range);
+                pixel.set_contrast(around.clone().map(range));
+                if around.clone().all(|index| extended(index).is_some()) {
+                    pixel.set_noise(&around.filter_map(extended));
+                }
+            }
             let unseen = found.next_if(|&(at, _)| at == index).map(|(_, unseen)| unseen);
             let mut pixel = OpenPixel { index, pixel, unseen };
             pixel.note_samples(search.as_ref(), area, seed, 1);
@@ -170,34 +191,17 @@ impl<'a> Sampler<'a> {
     }
 
     /// Finds the faces in the pixels of `area` that none of the first samples has met: for some
-    /// pixels, by their places in `area`, in order. `colors` and `hits` are what these samples, one in
-    /// each pixel of `wide`, saw and met.
+    /// pixels, by their places in `area`, in order.
     fn find_unseen(
         &mut self,
         search: &mut UnseenSearch<'a>,
         area: Area,
-        wide: Area,
-        colors: &[DVec3],
-        hits: &[Hit],
+        firsts: &FirstSamples,
     ) -> ControlFlow<(), Vec<(u32, UnseenFaces)>> {
-        let seed = self.quality.seed;
         let mut found = Vec::new();
         for block in area.blocks(32) {
             (self.on_progress)()?;
-            let first_sample = |x: u32, y: u32| {
-                let pixel = wide.index_of(x, y) as usize;
-                let place = Samples::new(FEWEST_FOR_ERROR, seed, x, y).sample(0).place(x, y);
-                FirstSample { hit: hits[pixel], place, color: colors[pixel] }
-            };
-            let is_calm = |x: u32, y: u32| {
-                let own = hits[wide.index_of(x, y) as usize];
-                let surface = |hit: &Hit| hit.face.surface(self.view);
-                own.is_some()
-                    && neighbours(wide, x, y)
-                        .map(|pixel| &hits[pixel as usize])
-                        .all(|hit| hit.rank == own.rank || surface(hit) == surface(&own))
-            };
-            search.search(block, &first_sample, &is_calm, &mut |x, y, unseen| {
+            search.search(block, firsts, &mut |x, y, unseen| {
                 found.push((area.index_of(x, y), unseen));
             });
         }
@@ -291,7 +295,8 @@ impl OpenPixel {
             let places = (first..count).map(|number| samples.sample(number).place(x, y));
             search.note_samples(unseen, places, count);
         }
-        self.pixel.set_unseen(unseen.variance(count));
+        let (variance, feared) = (unseen.variance(count), unseen.feared_variance(count));
+        self.pixel.set_unseen(variance, feared, unseen.passed_share());
     }
 }
 
@@ -305,11 +310,4 @@ fn pixels_by_blocks(area: Area) -> Vec<u32> {
         }
     }
     all
-}
-
-/// The pixel (x, y) of the frame and its neighbours, by their places in an area that has them.
-fn neighbours(area: Area, x: u32, y: u32) -> impl Iterator<Item = u32> + Clone {
-    let [columns, rows] = [(x, area.columns()), (y, area.rows())]
-        .map(|(middle, all)| all.start.max(middle.saturating_sub(1))..all.end.min(middle + 2));
-    rows.flat_map(move |y| columns.clone().map(move |x| area.index_of(x, y)))
 }

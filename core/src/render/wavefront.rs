@@ -555,7 +555,7 @@ impl Wavefront {
             count += usize::from(height > 0.0 && !on_light.contains(&point.surface));
         }
         let (shadow_rays, arrivals) = (&shadow_rays[..count], &arrivals[..count]);
-        let aim = (light, shadow_rays);
+        let aim = (on_light, shadow_rays);
         trace_shadows(view, isa, &mut self.room, aim, &mut self.shares, on_progress)?;
         for (&(point, arrival), &share) in arrivals.iter().zip(&self.shares) {
             self.points[point].light += share * arrival;

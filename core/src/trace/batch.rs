@@ -11,18 +11,18 @@ use super::{
     hit::{Nearest, between, is_between, take_crossing, take_quadrangle, take_sphere},
     kernels::run_with_kernel,
     lanes::{CLASSES, MOST_RAYS},
+    lone::{Flights, visit_alone},
     packet::{Meeting, Packet, PacketStack, visit_packet},
     ray::{Hit, Ray, Shear},
     solid::Scratch,
-    traversal::{Stack, Step, visit},
+    traversal::{Stack, Step},
 };
 use crate::{
     isa::Isa,
     prepared::{
         face::Face,
         layout::View,
-        node::Frame,
-        record::{Item, LightRecord, Surface},
+        record::{Item, Surface},
     },
 };
 
@@ -41,6 +41,7 @@ pub(crate) struct Room(Box<Rooms>);
 struct Rooms {
     scratch: Scratch,
     stack: Stack,
+    flights: Flights,
     packet: Packet,
     packet_stack: PacketStack,
     /// The clear faces between rays and their lights: each with its ray's place, its rank and the share
@@ -62,17 +63,17 @@ pub(crate) fn trace(
     stop_unless(hits.len() == rays.len())
 }
 
-/// Finds which share of its light each ray, running to `light`, lets through: 0..=1.
+/// Finds which share of its light each ray, running to a light on the surfaces `ending_on`, lets
+/// through: 0..=1.
 pub(crate) fn trace_shadows(
     view: &View<'_>,
     isa: Isa,
     Room(room): &mut Room,
-    (light, rays): (&LightRecord, &[Ray]),
+    (ending_on, rays): (&[Surface], &[Ray]),
     shares: &mut Vec<f64>,
     on_progress: OnProgress<'_>,
 ) -> ControlFlow<()> {
     shares.clear();
-    let ending_on = view.coincident_surfaces(light);
     run_with_kernel(isa, view, &mut Shadows { room, rays, ending_on, shares, on_progress });
     stop_unless(shares.len() == rays.len())
 }
@@ -84,6 +85,12 @@ fn stop_unless(is_done: bool) -> ControlFlow<()> {
 
 /// Fewer rays of a class than this are traced alone.
 const FEWEST_RAYS: usize = 8;
+
+/// The same where a scene has [`DEEP`] items: rays that part on their long ways gain more by turns.
+const FEWEST_IN_DEPTH: usize = 24;
+
+/// So many items make a hierarchy deep.
+const DEEP: usize = 4096;
 
 /// The places of rays that are traced in their own order.
 const IN_ORDER: [u16; RAYS_A_REPORT] = {
@@ -107,7 +114,9 @@ struct Order {
 
 impl Order {
     #[inline(always)]
-    fn new(kernel: impl BoxKernel, rays: &[Ray], frame: &Frame) -> Self {
+    fn new(kernel: impl BoxKernel, rays: &[Ray], view: &View<'_>) -> Self {
+        let frame = &view.header.frame;
+        let fewest = if view.faces.len() < DEEP { FEWEST_RAYS } else { FEWEST_IN_DEPTH };
         let mut classes = [0; RAYS_A_REPORT];
         for (classes, rays) in classes.as_chunks_mut().0.iter_mut().zip(rays.chunks(4)) {
             let mut four = [&rays[0]; 4];
@@ -116,7 +125,7 @@ impl Order {
         }
         let classes = &classes[..rays.len()];
         let differences = classes.iter().fold(0, |all, class| all | (class ^ classes[0]));
-        if differences == 0 {
+        if differences == 0 && rays.len() >= fewest {
             let mut ends = [0; CLASSES + 1];
             ends[classes[0] as usize..].fill(rays.len() as u16);
             return Self { places: IN_ORDER, ends };
@@ -125,27 +134,40 @@ impl Order {
         for &class in classes {
             ends[class as usize] += 1;
         }
+        // Classes of few rays are none.
+        let mut alone = [false; CLASSES + 1];
+        for class in 0..CLASSES {
+            if usize::from(ends[class]) < fewest {
+                alone[class] = true;
+                ends[CLASSES] += std::mem::take(&mut ends[class]);
+            }
+        }
         let mut end = 0;
         for count in &mut ends {
             (*count, end) = (end, end + *count);
         }
         let mut places = [0; RAYS_A_REPORT];
         for (place, &class) in (0..rays.len() as u16).zip(classes) {
-            let end = &mut ends[class as usize];
+            let class = if alone[class as usize] { CLASSES } else { class as usize };
+            let end = &mut ends[class];
             places[usize::from(*end)] = place;
             *end += 1;
         }
         Self { places, ends }
     }
 
-    /// The rays in packets of one class, and whether they go together.
-    fn packets(&self) -> impl Iterator<Item = (&[u16], bool)> {
+    /// The rays in packets of one class.
+    fn packets(&self) -> impl Iterator<Item = &[u16]> {
         let firsts = std::iter::once(0).chain(self.ends);
-        firsts.zip(self.ends).enumerate().flat_map(|(class, (first, end))| {
-            let run = &self.places[usize::from(first)..usize::from(end)];
-            let is_class = class < CLASSES;
-            run.chunks(MOST_RAYS).map(move |run| (run, is_class && run.len() >= FEWEST_RAYS))
+        firsts.zip(&self.ends[..CLASSES]).flat_map(|(first, &end)| {
+            self.places[usize::from(first)..usize::from(end)].chunks(MOST_RAYS)
         })
+    }
+
+    /// The rays that go alone.
+    fn lone(&self) -> &[u16] {
+        let [first, end] = [self.ends[CLASSES - 1], self.ends[CLASSES]].map(usize::from);
+        &self.places[first..end]
     }
 }
 
@@ -159,7 +181,7 @@ struct Trace<'a> {
 impl KernelWork<View<'_>> for Trace<'_> {
     #[inline(always)]
     fn run(&mut self, view: &View<'_>, kernel: impl BoxKernel) {
-        let Rooms { scratch, stack, packet, packet_stack, .. } = &mut *self.room;
+        let Rooms { scratch, stack, flights, packet, packet_stack, .. } = &mut *self.room;
         for rays in self.rays.chunks(RAYS_A_REPORT) {
             if (self.on_progress)().is_break() {
                 return;
@@ -167,27 +189,16 @@ impl KernelWork<View<'_>> for Trace<'_> {
             let first = self.hits.len();
             self.hits.extend(rays.iter().map(|ray| Hit::none(ray.reach)));
             let hits = &mut self.hits[first..];
-            for (members, go_together) in Order::new(kernel, rays, &view.header.frame).packets() {
-                if !go_together {
-                    for &member in members {
-                        let ray = &rays[usize::from(member)];
-                        let mut nearest = Nearest::new(ray);
-                        visit(kernel, view, ray, stack, |item, box_ray| {
-                            if nearest.meet(view, kernel, box_ray, item, scratch) {
-                                Step::On(nearest.hit.t)
-                            } else {
-                                Step::Past
-                            }
-                        });
-                        hits[usize::from(member)] = nearest.hit;
-                    }
-                    continue;
-                }
+            let order = Order::new(kernel, rays, view);
+            for members in order.packets() {
                 packet.fill(kernel, &view.header.frame, rays, members);
                 let scratch = &mut *scratch;
                 let mut meeting = NearestOfPacket { view, kernel, rays, members, hits, scratch };
                 visit_packet(kernel, view, packet, (packet_stack, stack), &mut meeting);
             }
+            let members = order.lone();
+            let mut meeting = NearestOfPacket { view, kernel, rays, members, hits, scratch };
+            visit_alone(kernel, view, (rays, members), flights, &mut meeting);
         }
     }
 }
@@ -257,7 +268,7 @@ struct Shadows<'a> {
 impl KernelWork<View<'_>> for Shadows<'_> {
     #[inline(always)]
     fn run(&mut self, view: &View<'_>, kernel: impl BoxKernel) {
-        let Rooms { scratch, stack, packet, packet_stack, clear } = &mut *self.room;
+        let Rooms { scratch, stack, flights, packet, packet_stack, clear } = &mut *self.room;
         for rays in self.rays.chunks(RAYS_A_REPORT) {
             if (self.on_progress)().is_break() {
                 return;
@@ -266,28 +277,17 @@ impl KernelWork<View<'_>> for Shadows<'_> {
             self.shares.resize(first + rays.len(), 1.0);
             let shares = &mut self.shares[first..];
             clear.clear();
-            for (members, go_together) in Order::new(kernel, rays, &view.header.frame).packets() {
-                let shades = Shades {
-                    ending_on: self.ending_on,
-                    has_clear: view.header.features.has_clear_shadows(),
-                    shares,
-                    clear,
-                };
-                let scratch = &mut *scratch;
-                let mut meeting = BlockedOfPacket { view, kernel, rays, members, scratch, shades };
-                if go_together {
-                    packet.fill(kernel, &view.header.frame, rays, members);
-                    visit_packet(kernel, view, packet, (packet_stack, stack), &mut meeting);
-                    continue;
-                }
-                for (place, &member) in members.iter().enumerate() {
-                    let ray = &rays[usize::from(member)];
-                    let shear = Shear::new(ray.origin, ray.direction);
-                    visit(kernel, view, ray, stack, |item, box_ray| {
-                        meeting.ask(place, item, &shear, box_ray)
-                    });
-                }
+            let order = Order::new(kernel, rays, view);
+            let has_clear = view.header.features.has_clear_shadows();
+            let shades = Shades { ending_on: self.ending_on, has_clear, shares, clear };
+            let mut meeting = BlockedOfPacket { view, kernel, rays, members: &[], scratch, shades };
+            for members in order.packets() {
+                packet.fill(kernel, &view.header.frame, rays, members);
+                meeting.members = members;
+                visit_packet(kernel, view, packet, (packet_stack, stack), &mut meeting);
             }
+            meeting.members = order.lone();
+            visit_alone(kernel, view, (rays, order.lone()), flights, &mut meeting);
             // In an order that does not depend on the tree, for products round.
             clear.sort_unstable_by_key(|&(member, rank, _)| (member, rank));
             for &(member, _, share) in clear.iter() {

@@ -6,9 +6,9 @@
 
 use super::{
     box_ray::BoxRay,
-    lanes::{self, Beam, Crossings, GROUPS, LANES, RayGroup, Turn, larger, smaller},
+    lanes::{self, Beam, Crossings, FACES, GROUPS, LANES, RayGroup, Turn, larger, smaller},
     parallelepiped::PlaneCrossings,
-    ray::Ray,
+    ray::{Ray, Shear},
 };
 use crate::prepared::{
     node::{Frame, Node},
@@ -78,6 +78,22 @@ pub(super) trait BoxKernel: Copy {
     ) -> Crossings {
         lanes::cross(groups, corners, mask, distances)
     }
+
+    /// What one ray is to four triangles, a bit each. Writes the distances of those that it crosses for
+    /// certain, the same to the bit as `hit_triangle`.
+    #[inline(always)]
+    fn cross_four(
+        self,
+        shear: &Shear,
+        corners: &[[&[f64; 3]; 3]; FACES],
+        distances: &mut [f64; FACES],
+    ) -> Crossings {
+        lanes::cross_four(shear, corners, distances)
+    }
+
+    /// Asks for what is at an address to be brought near, if there is anything.
+    #[inline(always)]
+    fn prefetch<T>(self, _place: &T) {}
 
     /// Where the line of a ray enters the last plane of a parallelepiped and leaves the first one:
     /// before it enters, if it passes by. With it comes the least cosine between the line and a

@@ -11,8 +11,8 @@ use super::{
     box_ray::BoxRay,
     boxes::{BoxKernel, KernelWork},
     boxes_x86::Avx2Boxes,
-    lanes::{Beam, Crossings, GROUPS, LANES, RayGroup, Turn},
-    ray::Ray,
+    lanes::{Beam, Crossings, FACES, GROUPS, LANES, RayGroup, Turn},
+    ray::{Ray, Shear},
 };
 use crate::prepared::{
     node::{Frame, Node},
@@ -90,6 +90,21 @@ impl BoxKernel for Avx512Boxes {
     #[inline(always)]
     fn meet_beam(self, node: &Node, beam: &Beam) -> ([f32; 8], u32) {
         self.0.meet_beam(node, beam)
+    }
+
+    #[inline(always)]
+    fn cross_four(
+        self,
+        shear: &Shear,
+        corners: &[[&[f64; 3]; 3]; FACES],
+        distances: &mut [f64; FACES],
+    ) -> Crossings {
+        self.0.cross_four(shear, corners, distances)
+    }
+
+    #[inline(always)]
+    fn prefetch<T>(self, place: &T) {
+        self.0.prefetch(place);
     }
 
     #[inline(always)]

@@ -1,28 +1,28 @@
 //! The test of a ray against a node's boxes with x86-64's instructions, and those of several rays.
 
 use std::arch::x86_64::{
-    __m256, __m256d, _CMP_EQ_OQ, _CMP_GE_OQ, _CMP_GT_OQ, _CMP_LE_OQ, _CMP_LT_OQ, _mm_cmple_ps,
-    _mm_cvtss_f32, _mm_loadu_ps, _mm_max_ps, _mm_max_ss, _mm_min_ps, _mm_min_ss, _mm_movehdup_ps,
-    _mm_movehl_ps, _mm_movemask_ps, _mm_mul_ps, _mm_set1_ps, _mm_storeu_ps, _mm_sub_ps,
-    _mm256_add_epi32, _mm256_add_pd, _mm256_and_pd, _mm256_and_si256, _mm256_andnot_pd,
-    _mm256_blendv_pd, _mm256_castpd_ps, _mm256_castpd_si256, _mm256_castps_si256,
+    __m256, __m256d, _CMP_EQ_OQ, _CMP_GE_OQ, _CMP_GT_OQ, _CMP_LE_OQ, _CMP_LT_OQ, _MM_HINT_T0,
+    _mm_cmple_ps, _mm_cvtss_f32, _mm_loadu_ps, _mm_max_ps, _mm_max_ss, _mm_min_ps, _mm_min_ss,
+    _mm_movehdup_ps, _mm_movehl_ps, _mm_movemask_ps, _mm_mul_ps, _mm_prefetch, _mm_set1_ps,
+    _mm_storeu_ps, _mm_sub_ps, _mm256_add_epi32, _mm256_add_pd, _mm256_and_pd, _mm256_and_si256,
+    _mm256_andnot_pd, _mm256_blendv_pd, _mm256_castpd_ps, _mm256_castpd_si256, _mm256_castps_si256,
     _mm256_castps256_ps128, _mm256_castsi256_pd, _mm256_castsi256_ps, _mm256_cmp_pd, _mm256_cmp_ps,
     _mm256_cvtpd_ps, _mm256_cvtps_pd, _mm256_div_pd, _mm256_extractf128_ps, _mm256_load_pd,
     _mm256_load_ps, _mm256_loadu_pd, _mm256_loadu_ps, _mm256_max_pd, _mm256_max_ps, _mm256_min_pd,
     _mm256_min_ps, _mm256_movemask_pd, _mm256_movemask_ps, _mm256_mul_pd, _mm256_mul_ps,
     _mm256_or_pd, _mm256_or_si256, _mm256_permute2f128_pd, _mm256_permute4x64_epi64,
     _mm256_set_m128, _mm256_set1_epi32, _mm256_set1_epi64x, _mm256_set1_pd, _mm256_set1_ps,
-    _mm256_setzero_pd, _mm256_shuffle_ps, _mm256_srai_epi32, _mm256_store_pd, _mm256_store_ps,
-    _mm256_storeu_pd, _mm256_storeu_ps, _mm256_storeu_si256, _mm256_sub_epi32, _mm256_sub_pd,
-    _mm256_sub_ps, _mm256_unpackhi_pd, _mm256_unpacklo_pd,
+    _mm256_setr_pd, _mm256_setzero_pd, _mm256_shuffle_ps, _mm256_srai_epi32, _mm256_store_pd,
+    _mm256_store_ps, _mm256_storeu_pd, _mm256_storeu_ps, _mm256_storeu_si256, _mm256_sub_epi32,
+    _mm256_sub_pd, _mm256_sub_ps, _mm256_unpackhi_pd, _mm256_unpacklo_pd,
 };
 
 use super::{
     box_ray::{BoxRay, FAR, NEAR, NEAR_FRAME},
     boxes::{BoxKernel, KernelWork},
-    lanes::{Beam, CLASSES, Crossings, GROUPS, LANES, LEAST_COMPONENT, RayGroup, Turn},
+    lanes::{Beam, CLASSES, Crossings, FACES, GROUPS, LANES, LEAST_COMPONENT, RayGroup, Turn},
     parallelepiped_x86,
-    ray::Ray,
+    ray::{Ray, Shear},
 };
 use crate::prepared::{
     node::{Frame, Node},
@@ -71,6 +71,16 @@ impl BoxKernel for Sse2Boxes {
     #[inline(always)]
     fn cross_box(self, ray: &Ray, left_at: f64, planes: &BoxPlanes) -> ([f64; 2], f64) {
         parallelepiped_x86::cross_box(ray, left_at, planes)
+    }
+}
+
+/// Asks for what is at an address, line by line.
+#[inline(always)]
+fn prefetch<T>(place: &T) {
+    let first: *const i8 = std::ptr::from_ref(place).cast();
+    for line in (0..size_of::<T>()).step_by(64) {
+        // SAFETY: SSE is part of x86-64, and nothing is read.
+        unsafe { _mm_prefetch::<_MM_HINT_T0>(first.wrapping_add(line)) };
     }
 }
 
@@ -370,49 +380,106 @@ impl BoxKernel for Avx2Boxes {
                     y[corner] = _mm256_sub_pd(up, _mm256_mul_pd(load(slopes[1]), depth));
                     z[corner] = _mm256_mul_pd(load(slopes[2]), depth);
                 }
-                let edge = |a: usize, b: usize| {
-                    _mm256_sub_pd(_mm256_mul_pd(x[a], y[b]), _mm256_mul_pd(y[a], x[b]))
-                };
-                let over = [edge(1, 2), edge(2, 0), edge(0, 1)];
-                let least = _mm256_min_pd(over[0], _mm256_min_pd(over[1], over[2]));
-                let most = _mm256_max_pd(over[0], _mm256_max_pd(over[1], over[2]));
-                let is_below = _mm256_cmp_pd::<_CMP_LT_OQ>(least, zero);
-                let is_above = _mm256_cmp_pd::<_CMP_GT_OQ>(most, zero);
-                let is_past = _mm256_and_pd(is_below, is_above);
-                let possible = !(_mm256_movemask_pd(is_past) as u64) & asking;
-                if possible == 0 {
-                    continue;
-                }
-                let sign = _mm256_set1_pd(-0.0);
-                let size = |a| _mm256_andnot_pd(sign, a);
-                let of_corner = |c: usize| _mm256_max_pd(size(x[c]), size(y[c]));
-                let extent = _mm256_max_pd(of_corner(0), _mm256_max_pd(of_corner(1), of_corner(2)));
-                let area = _mm256_add_pd(_mm256_add_pd(over[0], over[1]), over[2]);
-                let bound = _mm256_mul_pd(_mm256_mul_pd(extent, extent), _mm256_set1_pd(0.125));
-                let is_plain = _mm256_cmp_pd::<_CMP_GT_OQ>(size(area), bound);
-                let is_one_sided = _mm256_or_pd(
-                    _mm256_cmp_pd::<_CMP_GT_OQ>(least, zero),
-                    _mm256_cmp_pd::<_CMP_LT_OQ>(most, zero),
-                );
-                let is_certain = _mm256_and_pd(is_plain, is_one_sided);
-                let weighted = |k: usize| _mm256_mul_pd(over[k], z[k]);
-                let sum = _mm256_add_pd(_mm256_add_pd(weighted(0), weighted(1)), weighted(2));
-                let nearest = _mm256_min_pd(_mm256_min_pd(z[0], z[1]), z[2]);
-                let farthest = _mm256_max_pd(_mm256_max_pd(z[0], z[1]), z[2]);
-                let t = _mm256_max_pd(_mm256_div_pd(sum, area), nearest);
-                let t = _mm256_min_pd(t, farthest);
-                _mm256_storeu_pd(distances[half / 2].as_mut_ptr().add(first), t);
-                [possible, _mm256_movemask_pd(is_certain) as u64 & possible]
+                let four = &mut distances.as_flattened_mut().as_chunks_mut().0[half];
+                self.cross_seen([x, y, z], asking, four)
             };
             crossings.possible |= possible << (4 * half);
             crossings.certain |= certain << (4 * half);
         }
         crossings
     }
+
+    #[inline(always)]
+    fn cross_four(
+        self,
+        shear: &Shear,
+        corners: &[[&[f64; 3]; 3]; FACES],
+        distances: &mut [f64; FACES],
+    ) -> Crossings {
+        let [a, b, c, d] = corners;
+        let [x, y, z] = shear.axes;
+        assert!(x < 3 && y < 3 && z < 3);
+        // SAFETY: a value of this type says that the CPU has AVX2. A corner has three numbers, and axes
+        // are below 3.
+        let [possible, certain] = unsafe {
+            let zero = _mm256_setzero_pd();
+            let [mut x, mut y, mut z] = [[zero; 3]; 3];
+            for corner in 0..3 {
+                let mut seen = [zero; 3];
+                for (k, seen) in seen.iter_mut().enumerate() {
+                    let axis = shear.axes[k];
+                    let at = |corners: &[&[f64; 3]; 3]| *corners[corner].get_unchecked(axis);
+                    let places = _mm256_setr_pd(at(a), at(b), at(c), at(d));
+                    *seen = _mm256_sub_pd(places, _mm256_set1_pd(shear.origin[k]));
+                }
+                let [right, up, depth] = seen;
+                let slope = |k: usize| _mm256_mul_pd(_mm256_set1_pd(shear.slopes[k]), depth);
+                x[corner] = _mm256_sub_pd(right, slope(0));
+                y[corner] = _mm256_sub_pd(up, slope(1));
+                z[corner] = slope(2);
+            }
+            self.cross_seen([x, y, z], 0xF, distances)
+        };
+        Crossings { possible, certain }
+    }
+
+    #[inline(always)]
+    fn prefetch<T>(self, place: &T) {
+        prefetch(place);
+    }
 }
 
 #[expect(clippy::unused_self, reason = "a value says that the CPU has the instructions")]
 impl Avx2Boxes {
+    /// What the rays of a mask are to triangles that they see so, four lanes of corners on each axis: those
+    /// that may cross them, and those that do for certain, whose distances are written.
+    #[inline(always)]
+    fn cross_seen(
+        self,
+        [x, y, z]: [[__m256d; 3]; 3],
+        asking: u64,
+        distances: &mut [f64; 4],
+    ) -> [u64; 2] {
+        // SAFETY: a value of this type says that the CPU has AVX2. The store takes an array of exactly 4
+        // numbers.
+        unsafe {
+            let zero = _mm256_setzero_pd();
+            let edge = |a: usize, b: usize| {
+                _mm256_sub_pd(_mm256_mul_pd(x[a], y[b]), _mm256_mul_pd(y[a], x[b]))
+            };
+            let over = [edge(1, 2), edge(2, 0), edge(0, 1)];
+            let least = _mm256_min_pd(over[0], _mm256_min_pd(over[1], over[2]));
+            let most = _mm256_max_pd(over[0], _mm256_max_pd(over[1], over[2]));
+            let is_below = _mm256_cmp_pd::<_CMP_LT_OQ>(least, zero);
+            let is_above = _mm256_cmp_pd::<_CMP_GT_OQ>(most, zero);
+            let is_past = _mm256_and_pd(is_below, is_above);
+            let possible = !(_mm256_movemask_pd(is_past) as u64) & asking;
+            if possible == 0 {
+                return [0; 2];
+            }
+            let sign = _mm256_set1_pd(-0.0);
+            let size = |a| _mm256_andnot_pd(sign, a);
+            let of_corner = |c: usize| _mm256_max_pd(size(x[c]), size(y[c]));
+            let extent = _mm256_max_pd(of_corner(0), _mm256_max_pd(of_corner(1), of_corner(2)));
+            let area = _mm256_add_pd(_mm256_add_pd(over[0], over[1]), over[2]);
+            let bound = _mm256_mul_pd(_mm256_mul_pd(extent, extent), _mm256_set1_pd(0.125));
+            let is_plain = _mm256_cmp_pd::<_CMP_GT_OQ>(size(area), bound);
+            let is_one_sided = _mm256_or_pd(
+                _mm256_cmp_pd::<_CMP_GT_OQ>(least, zero),
+                _mm256_cmp_pd::<_CMP_LT_OQ>(most, zero),
+            );
+            let is_certain = _mm256_and_pd(is_plain, is_one_sided);
+            let weighted = |k: usize| _mm256_mul_pd(over[k], z[k]);
+            let sum = _mm256_add_pd(_mm256_add_pd(weighted(0), weighted(1)), weighted(2));
+            let nearest = _mm256_min_pd(_mm256_min_pd(z[0], z[1]), z[2]);
+            let farthest = _mm256_max_pd(_mm256_max_pd(z[0], z[1]), z[2]);
+            let t = _mm256_max_pd(_mm256_div_pd(sum, area), nearest);
+            let t = _mm256_min_pd(t, farthest);
+            _mm256_storeu_pd(distances.as_mut_ptr(), t);
+            [possible, _mm256_movemask_pd(is_certain) as u64 & possible]
+        }
+    }
+
     /// The numbers of four rays side by side: starts, directions, reaches, and bits that mean no
     /// number.
     #[inline(always)]

@@ -57,7 +57,7 @@ mod tests {
         trace::{
             box_ray::BoxRay,
             boxes::BoxKernel,
-            lanes::{CLASSES, Crossings, LANES, MOST_RAYS, RayGroup, class_of},
+            lanes::{CLASSES, Crossings, FACES, LANES, MOST_RAYS, RayGroup, class_of},
             packet::Packet,
             ray::{Ray, Shear},
             triangle::hit_triangle,
@@ -298,5 +298,58 @@ mod tests {
             entered > 1_000 && crossed > 1_000 && doubted > 1_000,
             "{entered} boxes are entered, {crossed} triangles crossed, {doubted} in doubt"
         );
+    }
+
+    /// A ray and four triangles.
+    type Four = (Shear, [[[f64; 3]; 3]; FACES]);
+
+    /// Which of them it may cross, which for certain, and the bits of these distances.
+    type FoundOnFour = (Crossings, [Option<u64>; FACES]);
+
+    impl KernelWork<Four> for Option<FoundOnFour> {
+        fn run(&mut self, (shear, corners): &Four, kernel: impl BoxKernel) {
+            let corners = corners.each_ref().map(|corners| corners.each_ref());
+            let mut distances = [0.0; FACES];
+            let met = kernel.cross_four(shear, &corners, &mut distances);
+            let bits =
+                |lane: usize| (met.certain >> lane & 1 == 1).then_some(distances[lane].to_bits());
+            *self = Some((met, [0, 1, 2, 3].map(bits)));
+        }
+    }
+
+    #[test]
+    fn a_ray_is_to_four_triangles_what_it_is_to_each() {
+        let seed = 21;
+        let random = &mut Random::new(seed);
+        let (mut crossed, mut doubted) = (0, 0);
+        for case in 0..20_000 {
+            let mut point = || DVec3::from_array([(); 3].map(|()| grid_or_any(random)));
+            let corners = [(); FACES].map(|()| [(); 3].map(|()| point().to_array()));
+            let (origin, elsewhere) = (point(), point());
+            let [a, b, _] = corners[random.below(FACES)].map(DVec3::from_array);
+            let target = [a, a + 0.5 * (b - a), elsewhere][random.below(3)];
+            let direction = (target - origin).normalize();
+            let direction = if direction.is_finite() { direction } else { DVec3::Y };
+            let shear = Shear::new(origin, direction);
+            let find = |isa| {
+                let mut found = None;
+                run_with_kernel(isa, &(shear, corners), &mut found);
+                found.expect("the kernel ran")
+            };
+            let (met, distances) = find(Isa::Scalar);
+            for isa in Isa::ALL.into_iter().filter(|isa| isa.is_supported()) {
+                assert_eq!(find(isa), (met, distances), "seed {seed}, case {case}, {isa}");
+            }
+            for (lane, corners) in corners.iter().enumerate() {
+                let t = hit_triangle(shear.project_all(corners)).map(f64::to_bits);
+                let is = |mask: u64| mask >> lane & 1 == 1;
+                let what = format!("seed {seed}, case {case}, lane {lane}");
+                assert!(!is(met.certain) || distances[lane] == t, "{what}");
+                assert!(is(met.possible) || t.is_none(), "{what}");
+                crossed += u32::from(is(met.certain));
+                doubted += u32::from(is(met.possible & !met.certain));
+            }
+        }
+        assert!(crossed > 1_000 && doubted > 1_000, "{crossed} crossed, {doubted} in doubt");
     }
 }

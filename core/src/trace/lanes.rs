@@ -2,7 +2,7 @@
 
 use super::{
     box_ray::{BoxRay, FAR, NEAR_FRAME},
-    ray::{Ray, Shear, depth_axis, edge},
+    ray::{Projected, Ray, Shear, depth_axis, edge},
 };
 use crate::{
     exact::float::{above, below},
@@ -21,6 +21,9 @@ pub(super) const LANES: usize = 8;
 
 /// Groups of [`LANES`] rays.
 pub(super) const GROUPS: usize = 8;
+
+/// Triangles that one ray is tried on at once.
+pub(super) const FACES: usize = 4;
 
 /// The most rays: a bit each in a mask.
 pub(super) const MOST_RAYS: usize = LANES * GROUPS;
@@ -290,25 +293,49 @@ pub(super) fn cross(
         let mut possible = 0;
         for (lane, distance) in distances[k].iter_mut().enumerate() {
             let shear = shear_at(group, lane, [0, 1, 2]);
-            let [a, b, c] = shear.project_all(corners);
-            let over = [edge(&b, &c), edge(&c, &a), edge(&a, &b)];
-            let is_any = |is: fn(f64) -> bool| over.into_iter().any(is);
-            if is_any(|w| w < 0.0) && is_any(|w| w > 0.0) {
-                continue;
-            }
-            possible |= 1 << lane;
-            let extent = [a, b, c].iter().map(|p| p.x.abs().max(p.y.abs())).fold(0.0, f64::max);
-            let area = over[0] + over[1] + over[2];
-            if !over.contains(&0.0) && area.abs() > extent * extent / 8.0 {
-                certain |= 1 << (LANES * k + lane);
-                let t = (over[0] * a.z + over[1] * b.z + over[2] * c.z) / area;
-                let (least, most) = (a.z.min(b.z).min(c.z), a.z.max(b.z).max(c.z));
-                *distance = t.max(least).min(most);
-            }
+            let crossing = cross_seen(&shear.project_all(corners), distance);
+            possible |= crossing.possible << lane;
+            certain |= crossing.certain << (LANES * k + lane);
         }
         possible
     });
     Crossings { possible, certain: certain & mask }
+}
+
+/// `BoxKernel::cross_four` in plain Rust.
+#[inline(always)]
+pub(super) fn cross_four(
+    shear: &Shear,
+    corners: &[[&[f64; 3]; 3]; FACES],
+    distances: &mut [f64; FACES],
+) -> Crossings {
+    let mut crossings = Crossings::default();
+    for (lane, (corners, distance)) in corners.iter().zip(distances).enumerate() {
+        let crossing = cross_seen(&shear.project_all(&corners.map(|corner| *corner)), distance);
+        crossings.possible |= crossing.possible << lane;
+        crossings.certain |= crossing.certain << lane;
+    }
+    crossings
+}
+
+/// What one ray is to a triangle that it sees so: a bit each. Writes the distance if it crosses it for
+/// certain.
+#[inline(always)]
+fn cross_seen([a, b, c]: &[Projected; 3], distance: &mut f64) -> Crossings {
+    let over = [edge(b, c), edge(c, a), edge(a, b)];
+    let is_any = |is: fn(f64) -> bool| over.into_iter().any(is);
+    if is_any(|w| w < 0.0) && is_any(|w| w > 0.0) {
+        return Crossings::default();
+    }
+    let extent = [a, b, c].iter().map(|p| p.x.abs().max(p.y.abs())).fold(0.0, f64::max);
+    let area = over[0] + over[1] + over[2];
+    if over.contains(&0.0) || area.abs() <= extent * extent / 8.0 {
+        return Crossings { possible: 1, certain: 0 };
+    }
+    let t = (over[0] * a.z + over[1] * b.z + over[2] * c.z) / area;
+    let (least, most) = (a.z.min(b.z).min(c.z), a.z.max(b.z).max(c.z));
+    *distance = t.max(least).min(most);
+    Crossings { possible: 1, certain: 1 }
 }
 
 /// What a lane holds, as a [`Shear`] with these axes.

@@ -14,6 +14,7 @@ mod hit;
 pub(crate) mod kernels;
 mod lane_faces;
 mod lanes;
+mod lone;
 mod packet;
 mod parallelepiped;
 #[cfg(target_arch = "x86_64")]
@@ -24,6 +25,7 @@ pub(crate) mod quadrangle;
 pub(crate) mod ray;
 pub(crate) mod solid;
 pub(crate) mod sphere;
+pub(crate) mod timed;
 pub(crate) mod traversal;
 pub(crate) mod triangle;
 mod walk;

@@ -14,8 +14,9 @@ use super::{
     boxes::BoxKernel,
     lane_faces::{cross_plane, cross_sphere, cross_sphere_again, leaves, pass_quadrangle},
     lanes::{Beam, GROUPS, LANES, MOST_RAYS, RayGroup, Turn, larger, shear_at},
+    lone::step,
     ray::{Ray, Shear},
-    traversal::{STACK, Stack, Step, visit_from},
+    traversal::{STACK, Stack, Step},
 };
 use crate::prepared::{
     layout::View,
@@ -309,12 +310,19 @@ impl Packet {
         stack: &mut Stack,
         meeting: &mut impl Meeting,
     ) {
-        let (mut box_ray, shear) = (self.box_ray(place), self.shear(place));
-        let meet = |item, box_ray: &BoxRay| meeting.ask(place, item, &shear, box_ray);
-        if visit_from(kernel, view, (&mut box_ray, child), stack, || (), meet) {
+        let (box_ray, shear) = (self.box_ray(place), self.shear(place));
+        let Stack(traversal, room) = stack;
+        traversal.start(box_ray, child);
+        let is_known = loop {
+            if let Some(is_known) = step(kernel, view, (traversal, room), (place, &shear), meeting)
+            {
+                break is_known;
+            }
+        };
+        if is_known {
             self.alive &= !(1 << place);
         }
-        self.groups[place / LANES].high[place % LANES] = box_ray.high;
+        self.groups[place / LANES].high[place % LANES] = traversal.box_ray.high;
     }
 }
 

@@ -10,14 +10,31 @@ use crate::prepared::{
 /// Children that may wait while a ray visits others: seven on each level and the last node's.
 pub(super) const STACK: usize = 7 * MOST_LEVELS + 8;
 
-/// Room for them and for a node, kept from ray to ray: to fill it anew for each would cost as much as
-/// the ray.
+/// A ray on its way, nearer boxes first, and room for what waits; kept from ray to ray, for to fill it
+/// anew for each would cost as much as the ray.
 #[derive(Debug)]
-pub(super) struct Stack([(f32, Child); STACK], Node);
+pub(super) struct Traversal {
+    pub(super) box_ray: BoxRay,
+    current: Child,
+    /// Children that wait, each with where it begins, the nearest one last.
+    stack: [(f32, Child); STACK],
+    waiting: usize,
+}
+
+/// Room for a ray on its way and for a node.
+#[derive(Debug)]
+pub(super) struct Stack(pub(super) Traversal, pub(super) Node);
+
+impl Default for Traversal {
+    fn default() -> Self {
+        let stack = [(0.0, Child::NONE); STACK];
+        Self { box_ray: BoxRay::NOWHERE, current: Child::ROOT, stack, waiting: 0 }
+    }
+}
 
 impl Default for Stack {
     fn default() -> Self {
-        Self([(0.0, Child::NONE); STACK], Node::EMPTY)
+        Self(Traversal::default(), Node::EMPTY)
     }
 }
 
@@ -29,6 +46,77 @@ pub(super) enum Step {
     On(f64),
     /// The answer is known.
     Enough,
+}
+
+impl Step {
+    /// Takes it in; whether the answer is known.
+    #[inline(always)]
+    pub(super) fn take(self, box_ray: &mut BoxRay) -> bool {
+        match self {
+            Self::Past => {}
+            Self::On(reach) => box_ray.shorten(reach),
+            Self::Enough => return true,
+        }
+        false
+    }
+}
+
+impl Traversal {
+    /// Sets a ray out below one child alone.
+    #[inline(always)]
+    pub(super) fn start(&mut self, box_ray: BoxRay, child: Child) {
+        (self.box_ray, self.current, self.waiting) = (box_ray, child, 0);
+    }
+
+    /// The child that comes next.
+    #[inline(always)]
+    pub(super) fn current(&self) -> Child {
+        self.current
+    }
+
+    /// Enters the node that comes next; whether the way ends there.
+    #[inline(always)]
+    pub(super) fn enter(
+        &mut self,
+        kernel: impl BoxKernel,
+        view: &View<'_>,
+        room: &mut Node,
+    ) -> bool {
+        let node = view.node(self.current.node(), room);
+        let (distances, mut mask) = kernel.test(node, &self.box_ray);
+        if mask.is_power_of_two() {
+            self.current = node.children[mask.trailing_zeros() as usize & 7];
+            return false;
+        }
+        let first = self.waiting;
+        while mask != 0 {
+            let child = mask.trailing_zeros() as usize & 7;
+            mask &= mask - 1;
+            // Insert so that the nearest ends on top.
+            let mut at = self.waiting;
+            while at > first && self.stack[at - 1].0 < distances[child] {
+                self.stack[at] = self.stack[at - 1];
+                at -= 1;
+            }
+            self.stack[at] = (distances[child], node.children[child]);
+            self.waiting += 1;
+        }
+        self.leave()
+    }
+
+    /// Goes back to what waits; whether the way ends here.
+    #[inline(always)]
+    pub(super) fn leave(&mut self) -> bool {
+        while self.waiting > 0 {
+            self.waiting -= 1;
+            let (near, child) = self.stack[self.waiting];
+            if self.box_ray.reaches(near) {
+                self.current = child;
+                return false;
+            }
+        }
+        true
+    }
 }
 
 /// Calls `meet` for the items in the leaves that the ray enters, nearer boxes first, with the ray
@@ -51,60 +139,24 @@ pub(super) fn visit_nodes(
     view: &View<'_>,
     ray: &Ray,
     stack: &mut Stack,
-    enter: impl FnMut(),
-    meet: impl FnMut(Item, &BoxRay) -> Step,
-) {
-    let mut box_ray = BoxRay::new(ray.origin, ray.direction, ray.reach, &view.header.frame);
-    visit_from(kernel, view, (&mut box_ray, Child::ROOT), stack, enter, meet);
-}
-
-/// The same below one child alone; whether the answer is known.
-#[inline(always)]
-pub(super) fn visit_from(
-    kernel: impl BoxKernel,
-    view: &View<'_>,
-    (box_ray, mut current): (&mut BoxRay, Child),
-    Stack(stack, room): &mut Stack,
     mut enter: impl FnMut(),
     mut meet: impl FnMut(Item, &BoxRay) -> Step,
-) -> bool {
-    let mut waiting = 0;
+) {
+    let Stack(traversal, room) = stack;
+    let box_ray = BoxRay::new(ray.origin, ray.direction, ray.reach, &view.header.frame);
+    traversal.start(box_ray, Child::ROOT);
     loop {
-        if current.is_leaf() {
-            for item in view.items(current.items()) {
-                match meet(item, box_ray) {
-                    Step::Past => {}
-                    Step::On(reach) => box_ray.shorten(reach),
-                    Step::Enough => return true,
-                }
-            }
+        let current = traversal.current();
+        let ends = if current.is_leaf() {
+            let box_ray = &mut traversal.box_ray;
+            let mut items = view.items(current.items());
+            items.any(|item| meet(item, box_ray).take(box_ray)) || traversal.leave()
         } else {
             enter();
-            let node = view.node(current.node(), room);
-            let (distances, mut mask) = kernel.test(node, box_ray);
-            let first = waiting;
-            while mask != 0 {
-                let child = mask.trailing_zeros() as usize & 7;
-                mask &= mask - 1;
-                // Insert so that the nearest ends on top.
-                let mut at = waiting;
-                while at > first && stack[at - 1].0 < distances[child] {
-                    stack[at] = stack[at - 1];
-                    at -= 1;
-                }
-                stack[at] = (distances[child], node.children[child]);
-                waiting += 1;
-            }
-        }
-        current = loop {
-            if waiting == 0 {
-                return false;
-            }
-            waiting -= 1;
-            let (near, child) = stack[waiting];
-            if box_ray.reaches(near) {
-                break child;
-            }
+            traversal.enter(kernel, view, room)
         };
+        if ends {
+            return;
+        }
     }
 }

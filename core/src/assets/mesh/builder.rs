@@ -1,5 +1,6 @@
 //! Vertices and polygons as a file gives them into a mesh without copies.
 
+use bytemuck::Zeroable;
 use hashbrown::hash_table::Entry;
 use rayon::prelude::*;
 
@@ -8,6 +9,7 @@ use glam::DVec3;
 use super::error::{MeshError, MeshFault};
 use crate::{
     exact::{
+        hash::{HashFunction, Repeated},
         polygon,
         predicates::is_collinear,
         welding::{PointHasher, PointTable, find_firsts},
@@ -98,16 +100,19 @@ impl<T: Copy + Into<f64>> MeshBuilder<T> {
         }
     }
 
-    /// Adds the vertices of a file that gives all of them before its faces, finite and without negative
-    /// zeros, to an empty mesh: the index of each.
-    pub(super) fn add_vertices(&mut self, positions: &[[T; 3]]) -> Result<Vec<u32>, MeshFault>
+    /// Adds all vertices of a file, finite and without negative zeros, to an empty mesh: the index of
+    /// each.
+    pub(super) fn add_vertices(&mut self, positions: Vec<[T; 3]>) -> Result<Vec<u32>, MeshFault>
     where
         T: Sync,
     {
         u32::try_from(positions.len()).map_err(|_| MeshFault::TooLarge)?;
         let bits_of = |position: &[T; 3]| position.map(|number| number.into().to_bits());
-        let mut numbers = find_firsts(positions, bits_of);
-        self.vertices.reserve(positions.len());
+        let mut numbers = find_firsts(&positions, bits_of);
+        if numbers.par_iter().enumerate().all(|(k, &first)| first as usize == k) {
+            self.vertices = positions;
+            return Ok(numbers);
+        }
         for k in 0..numbers.len() {
             let first = numbers[k] as usize;
             numbers[k] = if first == k {
@@ -152,65 +157,32 @@ impl<T: Copy + Into<f64>> MeshBuilder<T> {
         &self.vertices
     }
 
-    /// Adds faces whose corners are among the vertices.
-    pub(super) fn append(&mut self, faces: &MeshFaces) -> Result<(), MeshFault> {
-        self.faces.triangles.extend(&faces.triangles);
-        self.faces.dropped.zero_area += faces.dropped.zero_area;
+    /// Takes the faces that pieces of a file have, whose corners are among the vertices.
+    pub(super) fn take_faces(&mut self, pieces: Vec<MeshFaces>) -> Result<(), MeshFault> {
+        self.faces.dropped.zero_area = pieces.iter().map(|faces| faces.dropped.zero_area).sum();
+        self.faces.triangles = join(pieces.into_iter().map(|faces| faces.triangles).collect());
         let is_too_large = self.faces.triangles.len() > u32::MAX as usize;
         if is_too_large { Err(MeshFault::TooLarge) } else { Ok(()) }
     }
 
-    /// Drops every copy of an earlier triangle. Only triangles of one smallest corner can be equal,
-    /// and those are few and near each other: this costs less than a table of all.
+    /// Drops every copy of an earlier triangle.
     fn drop_copies(&mut self) {
+        let function = HashFunction::random();
         let triangles = &self.faces.triangles;
-        // How many triangles have each smallest corner, then where those begin in `order`.
-        let mut starts = vec![0_u32; self.vertices.len() + 1];
-        for &triangle in triangles {
-            starts[turned(triangle)[0] as usize] += 1;
-        }
-        let mut sum = 0;
-        for start in &mut starts {
-            sum += *start;
-            *start = sum;
-        }
-        let mut order = vec![0_u32; triangles.len()];
-        for (index, &triangle) in triangles.iter().enumerate().rev() {
-            let start = &mut starts[turned(triangle)[0] as usize];
-            *start -= 1;
-            order[*start as usize] = index as u32;
-        }
-        let find_copies = |(starts, order): (&[u32], &mut [u32])| {
-            let mut copies: Vec<u32> = Vec::new();
-            let mut rest = order;
-            for bounds in starts.windows(2) {
-                let group;
-                (group, rest) = rest.split_at_mut((bounds[1] - bounds[0]) as usize);
-                group.sort_unstable_by_key(|&index| (turned(triangles[index as usize]), index));
-                let is_copy = |pair: &&[u32]| {
-                    turned(triangles[pair[0] as usize]) == turned(triangles[pair[1] as usize])
-                };
-                copies.extend(group.windows(2).filter(is_copy).map(|pair| pair[1]));
-            }
-            copies
-        };
-        let mut rest = &mut order[..];
-        let runs: Vec<(&[u32], &mut [u32])> = (0..self.vertices.len())
-            .step_by(CORNERS_AT_ONCE)
-            .map(|first| {
-                let starts = &starts[first..(first + CORNERS_AT_ONCE + 1).min(starts.len())];
-                let count = (starts[starts.len() - 1] - starts[0]) as usize;
-                let (run, later) = std::mem::take(&mut rest).split_at_mut(count);
-                rest = later;
-                (starts, run)
-            })
+        let hash = |&triangle: &[u32; 3]| function.hash(turned(triangle).map(u64::from));
+        let repeated = Repeated::new(triangles.len(), triangles.par_iter().map(hash));
+        let mut equal: Vec<([u32; 3], u32)> = (triangles.par_iter().zip(0..triangles.len() as u32))
+            .filter(|(triangle, _)| repeated.may_have(hash(triangle)))
+            .map(|(&triangle, index)| (turned(triangle), index))
             .collect();
-        let mut copies: Vec<u32> = runs.into_par_iter().flat_map_iter(find_copies).collect();
+        equal.par_sort_unstable();
+        let is_copy = |pair: &&[([u32; 3], u32)]| pair[0].0 == pair[1].0;
+        let mut copies: Vec<u32> = equal.windows(2).filter(is_copy).map(|pair| pair[1].1).collect();
         if copies.is_empty() {
             return;
         }
         self.faces.dropped.duplicates += copies.len() as u64;
-        copies.sort_unstable();
+        copies.par_sort_unstable();
         let mut copies = copies.into_iter().peekable();
         let mut index = 0;
         self.faces.triangles.retain(|_| {
@@ -262,8 +234,23 @@ impl MeshBuilder<f64> {
     }
 }
 
-/// A thread looks for copies among the triangles of so many smallest corners in one go.
-const CORNERS_AT_ONCE: usize = 1 << 14;
+/// Joins what was read of a file piece by piece, on rayon's threads.
+pub(super) fn join<T: Zeroable + Copy + Send + Sync>(mut pieces: Vec<Vec<T>>) -> Vec<T> {
+    if pieces.len() == 1 {
+        return pieces.remove(0);
+    }
+    let mut joined = bytemuck::zeroed_vec(pieces.iter().map(Vec::len).sum());
+    let mut rest = &mut joined[..];
+    let mut places = Vec::with_capacity(pieces.len());
+    for piece in &pieces {
+        let (place, later) = rest.split_at_mut(piece.len());
+        places.push(place);
+        rest = later;
+    }
+    let copy = |(piece, place): (Vec<T>, &mut [T])| place.copy_from_slice(&piece);
+    pieces.into_par_iter().zip(places).for_each(copy);
+    joined
+}
 
 /// Turns a triangle so that it begins with its smallest index.
 fn turned([a, b, c]: [u32; 3]) -> [u32; 3] {

@@ -4,7 +4,7 @@
 use rayon::prelude::*;
 
 use super::{
-    builder::{MeshBuilder, MeshFaces, MeshFile},
+    builder::{MeshBuilder, MeshFaces, MeshFile, join},
     error::{MeshError, MeshFault},
 };
 use crate::text::{
@@ -13,7 +13,7 @@ use crate::text::{
 };
 
 /// Large files are read by pieces of about so many bytes.
-const PIECE: usize = 1 << 20;
+const PIECE: usize = 1 << 18;
 
 /// Reads a file.
 pub(super) fn read_obj(text: &[u8]) -> Result<MeshFile, MeshError> {
@@ -37,13 +37,11 @@ fn read_in_pieces(text: &[u8], size: usize) -> Option<MeshFile> {
         count += positions.len();
     }
     let mut mesh = MeshBuilder::<f64>::with_capacity(0, 0);
-    let vertices = mesh.add_vertices(&of_pieces.concat()).ok()?;
+    let vertices = mesh.add_vertices(join(of_pieces)).ok()?;
     let faces: Vec<MeshFaces> = (pieces.par_iter().zip(firsts))
         .map(|(piece, first)| read_faces(piece, first, &vertices, mesh.vertices()))
         .collect::<Option<_>>()?;
-    for faces in faces {
-        mesh.append(&faces).ok()?;
-    }
+    mesh.take_faces(faces).ok()?;
     mesh.into_mesh().ok()
 }
 

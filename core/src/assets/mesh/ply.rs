@@ -1,8 +1,10 @@
 //! PLY files, ASCII and binary in both byte orders: the vertices' x, y, z and the faces' lists of
 //! vertices; all else is skipped. Source: Turk, "The PLY Polygon File Format" (1994).
 
+use rayon::prelude::*;
+
 use super::{
-    builder::{MeshBuilder, MeshFile},
+    builder::{MeshBuilder, MeshFaces, MeshFile},
     error::{MeshError, MeshFault, MeshPlace},
 };
 use crate::text::{
@@ -31,19 +33,81 @@ pub(super) fn read_ply(bytes: &[u8]) -> Result<MeshFile, MeshError> {
     let expected = vertex.count.min((bytes.len() / least_size) as u64) as usize;
     if coordinates.iter().flatten().all(|&(_, kind)| kind == Number::Float) {
         let single = |number: f64| number as f32 + 0.0;
-        read_elements(&header, bytes, MeshBuilder::with_capacity(expected, 0), single)?.into_mesh()
+        match read_in_pieces(&header, bytes, single) {
+            Some(mesh) => mesh.into_mesh(),
+            None => read_elements(&header, bytes, expected, single)?.into_mesh(),
+        }
     } else {
         let double = |number: f64| number + 0.0;
-        read_elements(&header, bytes, MeshBuilder::with_capacity(expected, 0), double)?.into_mesh()
+        match read_in_pieces(&header, bytes, double) {
+            Some(mesh) => mesh.into_mesh(),
+            None => read_elements(&header, bytes, expected, double)?.into_mesh(),
+        }
     }
 }
 
+/// A thread reads so many faces in one go.
+const FACES_AT_ONCE: usize = 1 << 14;
+
+/// Reads a binary file on rayon's threads: vertices of a fixed size, then faces. `None` where the file
+/// has another order, and where something is wrong.
+fn read_in_pieces<T: Copy + Into<f64> + Send + Sync>(
+    header: &Header<'_>,
+    bytes: &[u8],
+    convert: impl Fn(f64) -> T + Sync,
+) -> Option<MeshBuilder<T>> {
+    if header.format == Format::Ascii {
+        return None;
+    }
+    let mut body = Body { bytes, at: header.length, format: header.format };
+    let (mut mesh, mut numbers) = (MeshBuilder::with_capacity(0, 0), None);
+    for (place, element) in header.elements.iter().enumerate() {
+        match element.name {
+            b"vertex" if numbers.is_none() => {
+                let vertices = body.skip(element)?;
+                let places = [b"x", b"y", b"z"].map(|name| element.place(name));
+                let [Some(x), Some(y), Some(z)] = places else { return None };
+                let size = element.least_size(header.format);
+                let position = |vertex: &[u8]| {
+                    [x, y, z].map(|(at, kind)| {
+                        let mut body = Body { bytes: vertex, at, format: header.format };
+                        convert(body.number(kind).unwrap_or(f64::NAN))
+                    })
+                };
+                let positions: Vec<[T; 3]> =
+                    vertices.par_chunks_exact(size).map(position).collect();
+                let is_finite = |&number: &T| number.into().is_finite();
+                if !positions.par_iter().all(|position| position.iter().all(is_finite)) {
+                    return None;
+                }
+                numbers = Some(mesh.add_vertices(positions).ok()?);
+            }
+            b"face" if place + 1 == header.elements.len() => {
+                let numbers = numbers.as_deref()?;
+                let pieces = body.cut(element)?;
+                let read = |&(start, count): &(usize, usize)| {
+                    let mut body = Body { bytes, at: start, format: header.format };
+                    body.read_faces(element, count, numbers, mesh.vertices())
+                };
+                let faces = pieces.par_iter().map(read).collect::<Option<_>>()?;
+                mesh.take_faces(faces).ok()?;
+                return Some(mesh);
+            }
+            b"vertex" | b"face" => return None,
+            _ => _ = body.skip(element)?,
+        }
+    }
+    None
+}
+
+/// Reads a file element by element; it may hold `expected` vertices.
 fn read_elements<T: Copy + Into<f64>>(
     header: &Header<'_>,
     bytes: &[u8],
-    mut mesh: MeshBuilder<T>,
+    expected: usize,
     convert: impl Fn(f64) -> T,
 ) -> Result<MeshBuilder<T>, MeshError> {
+    let mut mesh = MeshBuilder::with_capacity(expected, 0);
     let vertex_count = header.element("vertex").map_or(0, |vertex| vertex.count);
     let mut vertices: Vec<u32> = Vec::new();
     // Faces that come before the vertices: how many corners, then those.
@@ -215,6 +279,12 @@ impl Element<'_> {
         Some((place, self.properties[place].kind))
     }
 
+    /// Finds the number called `name` in a binary element without lists: its first byte, and its type.
+    fn place(&self, name: &[u8]) -> Option<(usize, Number)> {
+        let (place, kind) = self.scalar(name)?;
+        Some((self.properties[..place].iter().map(|property| property.kind.size()).sum(), kind))
+    }
+
     /// Counts the least bytes that one takes.
     fn least_size(&self, format: Format) -> usize {
         let size = |property: &Property<'_>| match format {
@@ -287,7 +357,78 @@ struct Body<'t> {
     format: Format,
 }
 
-impl Body<'_> {
+impl<'t> Body<'t> {
+    /// Goes past binary elements without lists; these are their bytes.
+    fn skip(&mut self, element: &Element<'_>) -> Option<&'t [u8]> {
+        if element.properties.iter().any(|property| property.list.is_some()) {
+            return None;
+        }
+        let length = usize::try_from(element.count).ok()?;
+        let length = length.checked_mul(element.least_size(self.format))?;
+        let (elements, _) = self.bytes.get(self.at..)?.split_at_checked(length)?;
+        self.at += length;
+        Some(elements)
+    }
+
+    /// Goes past binary faces; where each run of them begins, and how many it has.
+    fn cut(&mut self, element: &Element<'_>) -> Option<Vec<(usize, usize)>> {
+        let mut runs = Vec::new();
+        let mut left = usize::try_from(element.count).ok()?;
+        while left > 0 {
+            let count = left.min(FACES_AT_ONCE);
+            runs.push((self.at, count));
+            for _ in 0..count {
+                for property in &element.properties {
+                    let length = match property.list {
+                        Some(Number::Uchar) => {
+                            self.at += 1;
+                            usize::from(*self.bytes.get(self.at - 1)?)
+                        }
+                        Some(kind) => self.whole(kind).ok()? as usize,
+                        None => 1,
+                    };
+                    self.at = self.at.checked_add(length.checked_mul(property.kind.size())?)?;
+                }
+                if self.at > self.bytes.len() {
+                    return None;
+                }
+            }
+            left -= count;
+        }
+        Some(runs)
+    }
+
+    /// Reads so many binary faces, with corners among the file's vertices, which are `numbers` among
+    /// `vertices`.
+    fn read_faces<T: Copy + Into<f64>>(
+        &mut self,
+        element: &Element<'_>,
+        count: usize,
+        numbers: &[u32],
+        vertices: &[[T; 3]],
+    ) -> Option<MeshFaces> {
+        let (mut faces, mut corners) = (MeshFaces::default(), Vec::new());
+        for _ in 0..count {
+            corners.clear();
+            for property in &element.properties {
+                match property.list {
+                    Some(length) if property.is_corners() => {
+                        for _ in 0..self.whole(length).ok()? {
+                            let index = self.whole(property.kind).ok()? as usize;
+                            corners.push(*numbers.get(index)?);
+                        }
+                    }
+                    Some(length) => {
+                        self.at += self.whole(length).ok()? as usize * property.kind.size();
+                    }
+                    None => self.at += property.kind.size(),
+                }
+            }
+            faces.add_polygon(vertices, &corners).ok()?;
+        }
+        Some(faces)
+    }
+
     /// Checks before the first element that the file is long enough for all.
     fn check_left(&self, element: &Element<'_>, index: u64) -> Result<(), MeshError> {
         if index == 0 {
@@ -369,10 +510,84 @@ impl Body<'_> {
     /// A number that is not negative and has no fraction.
     fn whole(&mut self, kind: Number) -> Result<i64, MeshFault> {
         let number = self.number(kind)?;
-        if number >= 0.0 && number.fract() == 0.0 && number < 1e15 {
-            Ok(number as i64)
+        let whole = number as i64;
+        if number >= 0.0 && whole as f64 == number && number < 1e15 {
+            Ok(whole)
         } else {
             Err(MeshFault::Whole)
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A binary file with vertices of numbers besides, equal ones among them, and faces of three and more
+    /// corners, some of them copies.
+    fn file(is_little: bool, last_corner: u32) -> Vec<u8> {
+        const VERTICES: u32 = 3000;
+        const FACES: u32 = 2 * FACES_AT_ONCE as u32 + 5;
+        let order = if is_little { "little" } else { "big" };
+        let mut bytes = format!(
+            "ply\nformat binary_{order}_endian 1.0\nelement other 2\nproperty short a\n\
+             element vertex {VERTICES}\nproperty uchar red\nproperty float x\nproperty double y\n\
+             property float z\nelement face {FACES}\nproperty uchar flags\n\
+             property list uchar int vertex_indices\nproperty list ushort float others\nend_header\n"
+        )
+        .into_bytes();
+        macro_rules! push {
+            ($number:expr) => {
+                let number = $number;
+                bytes.extend(if is_little { number.to_le_bytes() } else { number.to_be_bytes() })
+            };
+        }
+        bytes.extend([7; 4]);
+        for k in 0..VERTICES {
+            push!(9_u8);
+            push!((k % 50) as f32 - 0.0);
+            push!(f64::from(k / 50 % 40) * 0.1);
+            push!(-((k * k % 7) as f32));
+        }
+        for k in 0..FACES {
+            push!(1_u8);
+            let corners: u8 = if k % 5 == 0 { 4 } else { 3 };
+            push!(corners);
+            for corner in [0, 1, 51, 50].into_iter().take(usize::from(corners)) {
+                let is_last = k + 1 == FACES && corner == 51;
+                push!(if is_last { last_corner } else { (k * 37 + corner) % VERTICES });
+            }
+            push!((k % 3) as u16);
+            for _ in 0..k % 3 {
+                push!(0.5_f32);
+            }
+        }
+        bytes
+    }
+
+    #[test]
+    fn pieces_give_what_the_whole_gives() {
+        let double = |number: f64| number + 0.0;
+        for is_little in [true, false] {
+            let bytes = file(is_little, 5);
+            let header = Header::read(&bytes).unwrap();
+            let expected = read_elements(&header, &bytes, 0, double).unwrap().into_mesh().unwrap();
+            assert!(expected.shape.triangles.len() > 2000 && expected.dropped.duplicates > 0);
+            let found = read_in_pieces(&header, &bytes, double).unwrap().into_mesh().unwrap();
+            assert!(found == expected, "little: {is_little}");
+        }
+    }
+
+    #[test]
+    fn what_is_wrong_is_left_to_who_reads_in_order() {
+        let is_left = |bytes: &[u8]| {
+            read_in_pieces(&Header::read(bytes).unwrap(), bytes, |number| number).is_none()
+        };
+        let whole = file(true, 5);
+        assert!(!is_left(&whole));
+        assert!(is_left(&whole[..whole.len() - 1]));
+        assert!(is_left(&whole[..2000]));
+        assert!(is_left(&file(true, 3000)));
+        assert!(is_left(&file(true, u32::MAX)));
     }
 }

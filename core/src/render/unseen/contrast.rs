@@ -70,12 +70,18 @@ impl<'a> Contrasts<'a> {
         if a.material != b.material || a.beam != b.beam {
             return DVec3::INFINITY;
         }
+        let is_continued = b.normal.dot(a.point - b.point).abs() <= a.pixel_side;
+        if !is_continued && !self.shows_plain(&self.materials[a.material as usize]) {
+            return DVec3::INFINITY;
+        }
+        self.between_continued(a, b)
+    }
+
+    /// The same of surfels that have a material in common and of which one continues the other.
+    pub(super) fn between_continued(&self, a: &Surfel, b: &Surfel) -> DVec3 {
         let material = &self.materials[a.material as usize];
         if self.shows_plain(material) {
             return DVec3::ZERO;
-        }
-        if b.normal.dot(a.point - b.point).abs() > a.pixel_side {
-            return DVec3::INFINITY;
         }
         let Shares { own, other } = Shares::of(material);
         let brightest = own * DVec3::from_array(material.color) + other;

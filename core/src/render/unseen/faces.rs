@@ -6,7 +6,7 @@ use super::{
     contrast::Surfel,
     outline::{Corner, Fragment, contains},
 };
-use crate::render::pixel::UNSEEN;
+use crate::render::pixel::{UNSEEN, feared, missed};
 
 /// The faces that may be seen in a pixel and that no sample has passed yet.
 #[derive(Debug, Default)]
@@ -15,6 +15,9 @@ pub(in crate::render) struct UnseenFaces {
     /// The corners of all faces.
     corners: Vec<Corner>,
     gaps: Vec<Gap>,
+    /// The shares of the pixel that faces cover, away from the eye and towards it, and gaps leave, which
+    /// samples have passed by now.
+    passed: [f64; 2],
     /// How far, channel by channel, the colour of faces that were too many to be looked at may lie
     /// from that of the pixel; 0 where there were not too many.
     uncounted_contrast: DVec3,
@@ -61,6 +64,12 @@ impl UnseenFaces {
     /// the faces' contrast by their share of the pixel, if all samples missed them. Of a closed
     /// body only the side that faces the eye is seen, so the two sides are not added.
     pub(in crate::render) fn variance(&self, count: u32) -> DVec3 {
+        let (share, lack) = self.share_and_lack();
+        lack * lack * missed(share, count) + self.uncounted_variance(count)
+    }
+
+    /// The share of the pixel that all of it covers, 0..=1, and what the mean lacks if no sample meets it.
+    fn share_and_lack(&self) -> (f64, DVec3) {
         let mut shares = [0.0; 2];
         let mut lacks = [DVec3::ZERO; 2];
         for face in &self.faces {
@@ -73,14 +82,34 @@ impl UnseenFaces {
             share += gap.share;
             lack += gap.share * gap.contrast;
         }
-        let lack = lack / share.max(1.0);
+        (share.min(1.0), lack / share.max(1.0))
+    }
+
+    /// The variance that what samples missed adds in the decision to stop.
+    pub(in crate::render) fn feared_variance(&self, count: u32) -> DVec3 {
+        let (share, lack) = self.share_and_lack();
+        feared(share, lack, count) + self.uncounted_variance(count)
+    }
+
+    fn uncounted_variance(&self, count: u32) -> DVec3 {
         let n = f64::from(count);
-        lack * lack * power(1.0 - share.min(1.0), count)
-            + self.uncounted_contrast * self.uncounted_contrast * (UNSEEN / (n * n * n))
+        self.uncounted_contrast * self.uncounted_contrast * (UNSEEN / (n * n * n))
+    }
+
+    /// The share of the pixel, 0..=1, of what later samples met that the first one had missed.
+    pub(in crate::render) fn passed_share(&self) -> f64 {
+        self.passed[0].max(self.passed[1]).min(1.0)
+    }
+
+    /// Forgets what may hide, but not what was passed.
+    pub(super) fn forget_unseen(&mut self) {
+        *self = Self { passed: self.passed, ..Self::default() };
     }
 
     /// Takes in what else may hide in the pixel.
     pub(in crate::render) fn join(&mut self, other: Self) {
+        let [a, b] = other.passed;
+        self.passed = [self.passed[0] + a, self.passed[1] + b];
         let first = self.corners.len();
         self.corners.extend(other.corners);
         let moved =
@@ -120,7 +149,14 @@ impl UnseenFaces {
 
     /// Takes out the gaps that a place on the screen lies in.
     pub(super) fn remove_gaps_at(&mut self, place: [f64; 2]) {
-        self.gaps.retain(|gap| gap.covers.iter().any(|cover| contains(cover, place)));
+        let passed = &mut self.passed;
+        self.gaps.retain(|gap| {
+            let is_covered = gap.covers.iter().any(|cover| contains(cover, place));
+            if !is_covered {
+                *passed = passed.map(|share| share + gap.share);
+            }
+            is_covered
+        });
     }
 
     /// Takes out a face that covers a place on the screen.
@@ -130,7 +166,11 @@ impl UnseenFaces {
             let corners = &self.corners[face.first..face.first + face.corner_count];
             y >= low && y <= high && contains(corners, [x, y])
         });
-        passed.map(|face| self.faces.remove(face).surfel)
+        passed.map(|face| {
+            let UnseenFace { share, is_front, surfel, .. } = self.faces.remove(face);
+            self.passed[usize::from(is_front)] += share;
+            surfel
+        })
     }
 
     /// Lowers each face's contrast to at most what `contrast` gives for it.
@@ -138,30 +178,5 @@ impl UnseenFaces {
         for face in &mut self.faces {
             face.contrast = face.contrast.min(contrast(&face.surfel));
         }
-    }
-}
-
-/// Raises `base` to a whole power by squaring.
-fn power(base: f64, exponent: u32) -> f64 {
-    let (mut product, mut square, mut left) = (1.0, base, exponent);
-    while left > 0 {
-        if left & 1 == 1 {
-            product *= square;
-        }
-        square *= square;
-        left >>= 1;
-    }
-    product
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_power_is_a_product() {
-        assert_eq!(power(0.5, 0), 1.0);
-        assert_eq!(power(0.5, 13), 1.0 / 8192.0);
-        assert_eq!(power(0.0, 8), 0.0);
     }
 }

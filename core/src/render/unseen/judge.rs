@@ -5,10 +5,11 @@ use glam::DVec3;
 use super::{
     contrast::{Contrasts, Surfel},
     faces::{Gap, UnseenFaces},
-    outline::{Clipper, Fragment, Outline, Outlines, contains, fills},
+    first_samples::FirstSample,
+    outline::{Clipper, Corner, Fragment, Outline, Outlines, contains, fills},
     screen::{Reach, Rectangle, Screen},
 };
-use crate::{prepared::layout::View, trace::ray::Hit};
+use crate::prepared::layout::View;
 
 /// The share of a picture's error that one face may add unseen without being noted.
 const NEGLIGIBLE: f64 = 1.0 / 64.0;
@@ -19,17 +20,6 @@ const NEGLIGIBLE_SUM: f64 = 1.0 / 8.0;
 /// A face counts in a pixel if it begins at most this many times as deep as the deepest of what the
 /// pixel's samples met.
 pub(super) const DEPTH_RATIO: f64 = 1.25;
-
-/// A pixel's first sample.
-#[derive(Debug, Clone, Copy)]
-pub(in crate::render) struct FirstSample {
-    /// What its ray met, as seen from where the beam comes from.
-    pub(in crate::render) hit: Hit,
-    /// Where it lies on the screen, in pixels.
-    pub(in crate::render) place: [f64; 2],
-    /// What it saw.
-    pub(in crate::render) color: DVec3,
-}
 
 /// A beam of a pixel, and what counts in it.
 #[derive(Debug, Clone, Copy)]
@@ -67,39 +57,33 @@ impl<'a> Judge<'a> {
         }
     }
 
-    /// Finds what a pixel may hide up to a depth, among the outlines of its block. `around` are the first
-    /// samples of the pixels beside it that came the same way: those that passed a gap tell what is there.
-    pub(super) fn find_unseen(
+    /// Finds what a pixel may hide among the faces in its beam, in the order of their ranks. `around` are the
+    /// first samples of the pixels beside it that came the same way: those that passed a gap tell what is
+    /// there.
+    pub(super) fn find_unseen<'f>(
         &mut self,
         sight: &Sight<'_>,
-        outlines: &Outlines,
+        (outlines, suspects): (&Outlines, &[usize]),
         (x, y): (u32, u32),
         first: &FirstSample,
-        around: impl Iterator<Item = FirstSample>,
+        around: impl Iterator<Item = &'f FirstSample> + Clone,
     ) -> UnseenFaces {
         let pixel = Rectangle::of_pixel(x, y);
         let mut unseen = UnseenFaces::default();
-        let mut suspects = std::mem::take(&mut self.suspects);
-        suspects.clear();
-        suspects.extend((0..outlines.as_slice().len()).filter(|&index| {
-            let outline = &outlines.as_slice()[index];
-            outline.nearest <= sight.deepest && outline.bounds.overlaps(&pixel)
-        }));
-        suspects.sort_unstable_by_key(|&index| outlines.as_slice()[index].rank);
         let own = suspects
             .iter()
             .map(|&index| &outlines.as_slice()[index])
             .find(|outline| outline.rank == first.hit.rank);
         let is_filled = own.is_none_or(|own| fills(outlines.corners_of(own), &pixel));
         if suspects.len() > usize::from(own.is_some()) || !is_filled {
-            let seen = self.seen(sight, first);
+            let seen = self.seen(sight, first).map(|seen| Seen::new(sight, seen));
             if let (Some(seen), false) = (&seen, is_filled) {
-                let faces = (outlines, &suspects[..]);
+                let faces = (outlines, suspects);
                 if let Some(gap) = self.find_gap(sight, faces, &pixel, (first, seen), around) {
                     unseen.add_gap(gap);
                 }
             }
-            for &index in &suspects {
+            for &index in suspects {
                 let outline = &outlines.as_slice()[index];
                 let met = (first, seen.as_ref());
                 if first.hit.rank != outline.rank {
@@ -108,7 +92,6 @@ impl<'a> Judge<'a> {
             }
             self.drop_negligible(&mut unseen, 1);
         }
-        self.suspects = suspects;
         unseen
     }
 
@@ -126,38 +109,57 @@ impl<'a> Judge<'a> {
 
     /// Finds what the face that was seen and those that continue it leave uncovered. `suspects` are all
     /// faces in the pixel, in the order of their ranks.
-    fn find_gap(
+    fn find_gap<'f>(
         &mut self,
         sight: &Sight<'_>,
         (outlines, suspects): (&Outlines, &[usize]),
         pixel: &Rectangle,
-        (first, seen): (&FirstSample, &Surfel),
-        around: impl Iterator<Item = FirstSample>,
+        (first, seen): (&FirstSample, &Seen),
+        around: impl Iterator<Item = &'f FirstSample> + Clone,
     ) -> Option<Gap> {
         // What stands behind a face that is not in the beam is not in it either.
-        if sight.screen.depth(seen.point) > sight.deepest {
+        if sight.screen.depth(seen.surfel.point) > sight.deepest {
             return None;
         }
-        let passed = around.filter(|other| {
-            self.seen(sight, other).is_none_or(|other| is_behind(sight, other.point, seen))
-        });
-        let contrast = passed
-            .map(|other| (other.color - first.color).abs())
-            .reduce(DVec3::max)
-            .unwrap_or(first.color.max(DVec3::splat(sight.weight) - first.color));
-        let (mut covers, mut shares) = (Vec::new(), [0.0; 2]);
+        let apart = |other: &FirstSample| (other.color - first.color).abs();
+        let of_nothing = first.color.max(DVec3::splat(sight.weight) - first.color);
+        let most = around.clone().map(apart).fold(of_nothing, DVec3::max);
+        // What covers the pixel, first without its corners: few gaps are worth noting.
+        let mut shares = [0.0; 2];
+        let left = |shares: [f64; 2]| 1.0 - f64::max(shares[0], shares[1]);
+        let cut = |outline: &Outline, clipper: &mut Clipper| {
+            let corners = outlines.corners_of(outline);
+            if seen.surely_hides(corners) {
+                return None;
+            }
+            let fragment = Fragment::new(corners, &outline.bounds, pixel, &sight.reach, clipper)?;
+            let nearest = sight.screen.point(fragment.nearest);
+            (!is_behind(sight, nearest, &seen.surfel)).then_some(fragment)
+        };
         for &index in suspects {
-            let outline = &outlines.as_slice()[index];
-            let (corners, clipper) = (outlines.corners_of(outline), &mut self.clipper);
-            let cut = Fragment::new(corners, &outline.bounds, pixel, &sight.reach, clipper);
-            let Some(fragment) = cut else { continue };
-            if !is_behind(sight, sight.screen.point(fragment.nearest), seen) {
+            if let Some(fragment) = cut(&outlines.as_slice()[index], &mut self.clipper) {
                 shares[usize::from(fragment.is_front)] += fragment.share;
+            }
+            // The more there is the less is left.
+            if self.is_negligible(left(shares), most) {
+                return None;
+            }
+        }
+        let passed = around.filter(|other| {
+            self.seen(sight, other).is_none_or(|other| is_behind(sight, other.point, &seen.surfel))
+        });
+        let contrast = passed.map(apart).reduce(DVec3::max).unwrap_or(of_nothing);
+        let share = left(shares);
+        if self.is_negligible(share, contrast) {
+            return None;
+        }
+        let mut covers = Vec::new();
+        for &index in suspects {
+            if cut(&outlines.as_slice()[index], &mut self.clipper).is_some() {
                 covers.push(self.clipper.polygon().to_vec());
             }
         }
-        let share = 1.0 - shares[0].max(shares[1]);
-        (!self.is_negligible(share, contrast)).then_some(Gap { covers, share, contrast })
+        Some(Gap { covers, share, contrast })
     }
 
     /// Adds a face to what a pixel may hide, unless it shows nothing new there, is hidden or has
@@ -167,15 +169,32 @@ impl<'a> Judge<'a> {
         sight: &Sight<'_>,
         (outlines, outline): (&Outlines, &Outline),
         pixel: &Rectangle,
-        (first, seen): (&FirstSample, Option<&Surfel>),
+        (first, seen): (&FirstSample, Option<&Seen>),
         unseen: &mut UnseenFaces,
     ) {
         let material = outline.face.material_index(self.view);
         let mut contrast = self.contrast(sight, material, first.color);
-        if self.is_negligible(outline.bounds.common_area(pixel), contrast) {
+        let most_share = outline.bounds.common_area(pixel);
+        if self.is_negligible(most_share, contrast) {
             return;
         }
         let corners = outlines.corners_of(outline);
+        if let Some(seen) = seen {
+            if seen.surely_hides(corners) {
+                return;
+            }
+            let is_flat = !outline.face.is_round(self.view);
+            if is_flat && seen.surfel.material == material && seen.is_surely_continued_by(corners) {
+                // Any piece of a flat face tells how it is turned.
+                let piece = self.surfel(sight, outline, corners[0]);
+                let most = sight.weight * self.contrasts.between_continued(&piece, &seen.surfel);
+                if self.is_negligible(most_share, contrast.min(most))
+                    && seen.surely_faces_the_eye(&piece, corners)
+                {
+                    return;
+                }
+            }
+        }
         let Some(fragment) =
             Fragment::new(corners, &outline.bounds, pixel, &sight.reach, &mut self.clipper)
         else {
@@ -184,13 +203,11 @@ impl<'a> Judge<'a> {
         if self.is_negligible(fragment.share, contrast) {
             return;
         }
-        let screen = sight.screen;
+        let seen = seen.map(|seen| &seen.surfel);
         if seen.is_some_and(|seen| is_behind(sight, sight.screen.point(fragment.nearest), seen)) {
             return;
         }
-        let point = screen.point(fragment.middle);
-        let normal = self.normal(outline, point);
-        let surfel = Surfel::new(screen, sight.beam, material, normal, point);
+        let surfel = self.surfel(sight, outline, fragment.middle);
         if let Some(seen) = seen {
             contrast = contrast.min(sight.weight * self.contrasts.between(&surfel, seen));
         }
@@ -202,6 +219,14 @@ impl<'a> Judge<'a> {
         }
         let rows = [outline.bounds.low[1], outline.bounds.high[1]];
         unseen.add(&fragment, self.clipper.polygon(), rows, contrast, surfel);
+    }
+
+    /// The piece of a face at a corner.
+    fn surfel(&self, sight: &Sight<'_>, outline: &Outline, corner: Corner) -> Surfel {
+        let point = sight.screen.point(corner);
+        let normal = self.normal(outline, point);
+        let material = outline.face.material_index(self.view);
+        Surfel::new(sight.screen, sight.beam, material, normal, point)
     }
 
     /// How far the colour of a face may change that of the pixel, whose first samples saw `mean`.
@@ -261,10 +286,7 @@ impl<'a> Judge<'a> {
             }
             let Some(fragment) = cut(outline, &mut clipper) else { continue };
             if !self.is_negligible(fragment.share, contrast) {
-                let point = sight.screen.point(fragment.middle);
-                let normal = self.normal(outline, point);
-                let material = outline.face.material_index(self.view);
-                let surfel = Surfel::new(sight.screen, sight.beam, material, normal, point);
+                let surfel = self.surfel(sight, outline, fragment.middle);
                 let rows = [outline.bounds.low[1], outline.bounds.high[1]];
                 unseen.add(&fragment, clipper.polygon(), rows, contrast, surfel);
             }
@@ -311,8 +333,71 @@ impl<'a> Judge<'a> {
     fn drop_negligible(&self, unseen: &mut UnseenFaces, count: u32) {
         let lack = NEGLIGIBLE_SUM * self.error;
         if unseen.variance(count).max_element() < lack * lack {
-            *unseen = UnseenFaces::default();
+            unseen.forget_unseen();
         }
+    }
+}
+
+/// What a pixel's first sample saw, and its plane on the screen. Times the inverse depth the height of a
+/// point over the plane is linear in the place and the inverse depth, so that corners answer for all
+/// between them.
+struct Seen {
+    surfel: Surfel,
+    /// The height over a plane through the eye: at the frame's corner, and what a pixel to the right and
+    /// one down add.
+    rows: [f64; 3],
+    /// The height of what was seen.
+    height: f64,
+    /// The lengths of the terms, for their rounding: of `rows`, and of the point that was seen.
+    lengths: [f64; 4],
+    pixel_side: f64,
+}
+
+/// Room for rounding, relative to the terms; rounding is 2^10 times finer.
+const MARGIN: f64 = 1.0 / (1_u64 << 40) as f64;
+
+impl Seen {
+    fn new(sight: &Sight<'_>, surfel: Surfel) -> Self {
+        let Surfel { normal, point, .. } = surfel;
+        let [a, b, c] = sight.screen.axes();
+        let rows = [a, b, c].map(|axis| normal.dot(axis));
+        let lengths = [a, b, c, point].map(DVec3::length);
+        let pixel_side = sight.screen.pixel_side();
+        Self { surfel, rows, height: normal.dot(point), lengths, pixel_side }
+    }
+
+    /// A corner's height over the plane times its inverse depth, and the room for its rounding.
+    fn height_of(&self, [x, y, inverse_depth]: Corner) -> (f64, f64) {
+        let [a, b, c] = self.rows;
+        let [of_a, of_b, of_c, of_point] = self.lengths;
+        let height = a + x * b + y * c - self.height * inverse_depth;
+        let terms = of_a + x.abs() * of_b + y.abs() * of_c + of_point * inverse_depth;
+        (height, MARGIN * (terms + self.pixel_side))
+    }
+
+    /// Whether all between these corners surely stands behind, as [`is_behind`] says.
+    fn surely_hides(&self, corners: &[Corner]) -> bool {
+        corners.iter().all(|&corner| {
+            let (height, room) = self.height_of(corner);
+            height + self.pixel_side < -room
+        })
+    }
+
+    /// Whether all between these corners is surely so near to the plane that it may continue what was seen.
+    fn is_surely_continued_by(&self, corners: &[Corner]) -> bool {
+        corners.iter().all(|&corner| {
+            let (height, room) = self.height_of(corner);
+            height.abs() < self.pixel_side - room
+        })
+    }
+
+    /// Whether the eye surely sees the same side of the whole flat face that a piece is of.
+    fn surely_faces_the_eye(&self, piece: &Surfel, corners: &[Corner]) -> bool {
+        let [of_a, of_b, of_c, _] = self.lengths;
+        let distance = -piece.normal.dot(piece.point);
+        corners.iter().all(|&[x, y, inverse_depth]| {
+            distance * inverse_depth > MARGIN * (of_a + x.abs() * of_b + y.abs() * of_c)
+        })
     }
 }
 

@@ -13,19 +13,22 @@
 //! The same search goes on from flat surfaces ([`onward`]): towards the lights, for shadows, into
 //! mirrors and through what does not bend.
 
+mod bins;
 mod contrast;
 mod faces;
+mod first_samples;
 mod frustum;
 mod judge;
 mod onward;
 mod outline;
 mod screen;
 
-pub(super) use self::{faces::UnseenFaces, judge::FirstSample};
+pub(super) use self::{faces::UnseenFaces, first_samples::FirstSamples};
 
 use glam::DVec3;
 
 use self::{
+    bins::Bins,
     frustum::FrustumSearch,
     judge::{DEPTH_RATIO, Judge, Sight},
     onward::{OnwardSearch, Tools},
@@ -39,10 +42,10 @@ use crate::{
 };
 
 /// Sides, in pixels, of blocks that are searched in one go, and how many faces may be in their
-/// beams: a block with more is cut into those of the next size. A pixel with more is crowded.
-const BLOCKS: [(u32, usize); 3] = [(8, 128), (2, 64), (1, MOST_FACES)];
+/// beams: a block with more is cut into those of the next size.
+const BLOCKS: [(u32, usize); 3] = [(8, 1024), (2, 256), (1, MOST_FACES)];
 
-/// The most faces that a pixel is searched for.
+/// The most faces that a pixel is searched for. One with more is crowded.
 const MOST_FACES: usize = 128;
 
 /// In a crowded pixel faces count that stand this many pixels' widths before all that its samples
@@ -52,9 +55,9 @@ const CROWDED_CLEARANCE: f64 = 8.0;
 /// The search for what pixels may hide.
 pub(super) struct UnseenSearch<'a> {
     view: &'a View<'a>,
-    frame: Size,
     screen: Screen,
     frustum_search: FrustumSearch,
+    bins: Bins,
     judge: Judge<'a>,
     /// It is `None` where no surface sends beams on.
     onward: Option<OnwardSearch<'a>>,
@@ -73,9 +76,9 @@ impl<'a> UnseenSearch<'a> {
     ) -> Option<Self> {
         let screen = Screen::new(&view.header.camera, frame)?;
         let judge = Judge::new(view, flat, error);
-        let frustum_search = FrustumSearch::default();
+        let (frustum_search, bins) = Default::default();
         let onward = OnwardSearch::new(view, flat, isa);
-        Some(Self { view, frame, screen, frustum_search, judge, onward })
+        Some(Self { view, screen, frustum_search, bins, judge, onward })
     }
 
     /// The rays that the search has traced.
@@ -83,21 +86,20 @@ impl<'a> UnseenSearch<'a> {
         self.onward.as_ref().map_or(0, OnwardSearch::rays)
     }
 
-    /// Finds what may hide in the pixels of an area. `first_sample` tells what a pixel's first
-    /// sample saw, `is_calm` whether those around it met the same surface, and `on_found` gets each pixel that may hide something.
+    /// Finds what may hide in the pixels of an area: `on_found` gets each pixel that may hide something.
+    /// `firsts` have the pixels around it, too.
     pub(super) fn search(
         &mut self,
         area: Area,
-        first_sample: &impl Fn(u32, u32) -> FirstSample,
-        is_calm: &impl Fn(u32, u32) -> bool,
+        firsts: &FirstSamples,
         on_found: &mut impl FnMut(u32, u32, UnseenFaces),
     ) {
-        self.search_blocks(area, &BLOCKS, first_sample, on_found);
+        self.search_blocks(area, &BLOCKS, firsts, on_found);
         if let Some(onward) = &mut self.onward {
-            let looks = |x, y| is_calm(x, y).then(|| first_sample(x, y));
+            let look = |x, y| firsts.is_calm(self.view, x, y).then(|| *firsts.of(x, y));
             let (frustum_search, judge) = (&mut self.frustum_search, &mut self.judge);
             let tools = Tools { frustum_search, judge, on_found };
-            onward.search(&self.screen, area, tools, &looks);
+            onward.search(&self.screen, area, tools, &look);
         }
     }
 
@@ -105,31 +107,31 @@ impl<'a> UnseenSearch<'a> {
         &mut self,
         area: Area,
         sizes: &[(u32, usize)],
-        first_sample: &impl Fn(u32, u32) -> FirstSample,
+        firsts: &FirstSamples,
         on_found: &mut impl FnMut(u32, u32, UnseenFaces),
     ) {
         let Some((&(side, most), smaller)) = sizes.split_first() else {
-            let (x, y) = (area.x0(), area.y0());
-            return self.search_crowded((x, y), &first_sample(x, y), first_sample, on_found);
+            return self.search_crowded((area.x0(), area.y0()), firsts, on_found);
         };
         for block in area.blocks(side) {
-            let deepest = block
-                .pixels()
-                .map(|(x, y)| self.deepest(x, y, &first_sample(x, y).hit))
-                .fold(0.0, f64::max);
-            let beam = Beam { block: Rectangle::of_block(block), deepest };
-            if !self.frustum_search.collect(self.view, &self.screen, &beam, most) {
-                self.search_blocks(block, smaller, first_sample, on_found);
-                continue;
-            }
-            for (x, y) in block.pixels() {
-                let first = first_sample(x, y);
-                let unseen =
-                    self.find_unseen((x, y), &first, self.deepest(x, y, &first.hit), first_sample);
-                if !unseen.is_empty() {
-                    on_found(x, y, unseen);
+            let mut bins = std::mem::take(&mut self.bins);
+            bins.start(block, |x, y| self.deepest(x, y, &firsts.of(x, y).hit));
+            let beam = Beam { block: Rectangle::of_block(block), deepest: bins.deepest() };
+            if self.frustum_search.collect(self.view, &self.screen, &beam, most) {
+                bins.fill(&self.frustum_search.outlines);
+                for ((x, y), deepest, faces) in bins.pixels() {
+                    if faces.len() <= MOST_FACES {
+                        self.find_unseen((x, y), deepest, faces, firsts, on_found);
+                    }
                 }
+                let is_crowded = |(_, _, faces): &(_, _, &[usize])| faces.len() > MOST_FACES;
+                for (pixel, ..) in bins.pixels().filter(is_crowded) {
+                    self.search_crowded(pixel, firsts, on_found);
+                }
+            } else {
+                self.search_blocks(block, smaller, firsts, on_found);
             }
+            self.bins = bins;
         }
     }
 
@@ -138,21 +140,20 @@ impl<'a> UnseenSearch<'a> {
     fn search_crowded(
         &mut self,
         (x, y): (u32, u32),
-        first: &FirstSample,
-        first_sample: &impl Fn(u32, u32) -> FirstSample,
+        firsts: &FirstSamples,
         on_found: &mut impl FnMut(u32, u32, UnseenFaces),
     ) {
+        let first = firsts.of(x, y);
         let middle = self.screen.pixel_direction(x, y).length();
         let clearance = 1.0 - CROWDED_CLEARANCE * self.screen.pixel_side() / middle;
         let deepest = first.hit.t / middle * clearance;
         let beam = Beam { block: Rectangle::of_pixel(x, y), deepest };
-        let unseen = if self.frustum_search.collect(self.view, &self.screen, &beam, MOST_FACES) {
-            self.find_unseen((x, y), first, deepest, first_sample)
+        if self.frustum_search.collect(self.view, &self.screen, &beam, MOST_FACES) {
+            let faces = self.frustum_search.outlines.by_rank();
+            self.find_unseen((x, y), deepest, &faces, firsts, on_found);
         } else {
-            UnseenFaces::uncounted(first.color.max(DVec3::ONE - first.color))
-        };
-        if !unseen.is_empty() {
-            on_found(x, y, unseen);
+            let contrast = first.color.max(DVec3::ONE - first.color);
+            on_found(x, y, UnseenFaces::uncounted(contrast));
         }
     }
 
@@ -161,19 +162,23 @@ impl<'a> UnseenSearch<'a> {
         DEPTH_RATIO * hit.t / self.screen.pixel_direction(x, y).length()
     }
 
+    /// Judges the faces in a pixel's beam, in the order of their ranks.
     fn find_unseen(
         &mut self,
         (x, y): (u32, u32),
-        first: &FirstSample,
         deepest: f64,
-        first_sample: &impl Fn(u32, u32) -> FirstSample,
-    ) -> UnseenFaces {
+        faces: &[usize],
+        firsts: &FirstSamples,
+        on_found: &mut impl FnMut(u32, u32, UnseenFaces),
+    ) {
         let screen = &self.screen;
         let sight = Sight { screen, beam: 0, reach: Reach::Whole, weight: 1.0, deepest };
-        let pixel = Area::new(self.frame, [x, y], [1, 1]).expect("the frame has it");
-        let around = pixel.with_rim().pixels().map(|(x, y)| first_sample(x, y));
-        let outlines = &self.frustum_search.outlines;
-        self.judge.find_unseen(&sight, outlines, (x, y), first, around)
+        let faces = (&self.frustum_search.outlines, faces);
+        let around = firsts.around(x, y);
+        let unseen = self.judge.find_unseen(&sight, faces, (x, y), firsts.of(x, y), around);
+        if !unseen.is_empty() {
+            on_found(x, y, unseen);
+        }
     }
 
     /// Takes out of what a pixel may hide what its next samples, at these places in pixels on the

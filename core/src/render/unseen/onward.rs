@@ -10,8 +10,9 @@ use glam::DVec3;
 
 use super::{
     faces::UnseenFaces,
+    first_samples::FirstSample,
     frustum::FrustumSearch,
-    judge::{DEPTH_RATIO, FirstSample, Judge, Sight},
+    judge::{DEPTH_RATIO, Judge, Sight},
     outline::Outline,
     screen::{Beam, Reach, Rectangle, Screen, Sheet},
 };
@@ -306,7 +307,9 @@ impl<'a> OnwardSearch<'a> {
             let reach = Reach::Behind(*sheet);
             let sight = Sight { screen, beam: self.beam, reach, weight: look.weight, deepest };
             let outlines = &tools.frustum_search.outlines;
-            let unseen = tools.judge.find_unseen(&sight, outlines, (x, y), first, iter::empty());
+            let faces = outlines.by_rank();
+            let faces = (outlines, &faces[..]);
+            let unseen = tools.judge.find_unseen(&sight, faces, (x, y), first, iter::empty());
             if !unseen.is_empty() {
                 (tools.on_found)(x, y, unseen);
             }

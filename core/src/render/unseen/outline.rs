@@ -60,6 +60,13 @@ impl Outlines {
         &self.faces
     }
 
+    /// The indices of the outlines in the order of the faces' ranks.
+    pub(super) fn by_rank(&self) -> Vec<usize> {
+        let mut indices: Vec<usize> = (0..self.faces.len()).collect();
+        indices.sort_unstable_by_key(|&index| self.faces[index].rank);
+        indices
+    }
+
     /// Adds the outlines of an item's faces that are in the beam.
     pub(super) fn add_item(&mut self, view: &View<'_>, screen: &Screen, item: Item, beam: &Beam) {
         let face = Face::whole(item);

@@ -60,6 +60,11 @@ impl Screen {
         self.eye
     }
 
+    /// From the eye to the frame's top left corner, a pixel's step to the right, and one down.
+    pub(super) fn axes(&self) -> [DVec3; 3] {
+        self.axes
+    }
+
     /// The rows that turn a point into its depth, and into its column and its row times the depth.
     pub(super) fn inverse_rows(&self) -> [DVec3; 3] {
         self.inverse_rows
