@@ -41,7 +41,8 @@ pub(crate) struct Room(Box<Rooms>);
 struct Rooms {
     scratch: Scratch,
     stack: Stack,
-    flights: Flights,
+    /// Made when first a ray goes alone.
+    flights: Option<Box<Flights>>,
     packet: Packet,
     packet_stack: PacketStack,
     /// The clear faces between rays and their lights: each with its ray's place, its rank and the share

@@ -56,9 +56,13 @@ pub(super) fn visit_alone(
     kernel: impl BoxKernel,
     view: &View<'_>,
     (rays, members): (&[Ray], &[u16]),
-    Flights(flights, room): &mut Flights,
+    flights: &mut Option<Box<Flights>>,
     meeting: &mut impl Meeting,
 ) {
+    if members.is_empty() {
+        return;
+    }
+    let Flights(flights, room) = &mut **flights.get_or_insert_default();
     let mut flying = [0; FLIGHTS];
     let mut count = 0;
     while count < FLIGHTS.min(members.len()) {
