@@ -6,9 +6,9 @@
 //! foreign or of another build is as good as none.
 
 use std::{
-    fs::{self, DirBuilder, Metadata},
-    io::{self, Write},
-    os::unix::fs::{DirBuilderExt, MetadataExt},
+    fs::{self, DirBuilder, File, Metadata},
+    io::{self, BufRead, BufReader, Read, Write},
+    os::unix::fs::{DirBuilderExt, FileExt, MetadataExt},
     path::{Path, PathBuf},
     sync::Mutex,
     time::Duration,
@@ -40,6 +40,9 @@ const MOST_BYTES: u64 = 4 << 30;
 /// A file that is no entry yet, and is older than this, was left by a process that was killed.
 const ABANDONED: Duration = Duration::from_secs(3600);
 
+/// An entry's line is at most so long; a scene whose report and files make it longer is not found.
+const LONGEST_LINE: u64 = 1 << 24;
+
 /// What an entry's name ends with.
 const EXTENSION: &str = "scene";
 
@@ -63,7 +66,7 @@ pub(crate) struct NamedFiles(Mutex<Vec<(String, Hash)>>);
 
 impl NamedFiles {
     pub(crate) fn saw(&self, name: &str, data: &[u8]) {
-        let seen = (name.to_owned(), blake3::hash(data));
+        let seen = (name.to_owned(), content_hash(data));
         self.0.lock().expect("nothing here panics").push(seen);
     }
 }
@@ -109,8 +112,7 @@ impl Cache {
         read: impl Fn(&str) -> io::Result<Vec<u8>>,
     ) -> Option<Found> {
         let path = self.path(key);
-        let bytes = fs::read(&path).ok()?;
-        let found = open_entry(key, &bytes, read);
+        let found = open_entry(key, &File::open(&path).ok()?, read);
         if found.is_some() {
             let now = Timespec { tv_sec: 0, tv_nsec: UTIME_NOW };
             // If it cannot be marked as used it goes sooner, which is all.
@@ -194,13 +196,20 @@ fn remove(path: &Path) -> io::Result<()> {
     }
 }
 
+/// The hash of a file's content, made on rayon's threads.
+fn content_hash(data: &[u8]) -> Hash {
+    blake3::Hasher::new().update_rayon(data).finalize()
+}
+
 fn open_entry(
     key: &Hash,
-    bytes: &[u8],
+    entry: &File,
     read: impl Fn(&str) -> io::Result<Vec<u8>>,
 ) -> Option<Found> {
-    let end = bytes.iter().position(|&byte| byte == b'\n')?;
-    let (line, prepared) = (str::from_utf8(&bytes[..end]).ok()?, &bytes[end + 1..]);
+    let mut line = String::new();
+    BufReader::new(entry.take(LONGEST_LINE)).read_line(&mut line).ok()?;
+    let start = line.len() as u64;
+    let line = line.strip_suffix('\n')?;
     let (hash, told) = line.split_once(' ')?;
     if Hash::from_hex(hash).ok()? != blake3::hash(told.as_bytes()) {
         return None;
@@ -211,12 +220,14 @@ fn open_entry(
     }
     for file in told["files"].as_array()? {
         let (name, hash) = (file[0].as_str()?, Hash::from_hex(file[1].as_str()?).ok()?);
-        if blake3::hash(&read(name).ok()?) != hash {
+        if content_hash(&read(name).ok()?) != hash {
             return None;
         }
     }
     let size = Size::new(told["size"][0].as_u64()?, told["size"][1].as_u64()?).ok()?;
-    let prepared = PreparedBytes::copy_from(prepared);
+    let length = entry.metadata().ok()?.len().checked_sub(start)?;
+    let read = |place: &mut [u8], at: usize| entry.read_exact_at(place, start + at as u64);
+    let prepared = PreparedBytes::read(usize::try_from(length).ok()?, read).ok()?;
     let scene = PreparedScene::open(&prepared).ok()?;
     if told["prepared"].as_str()? != scene.hash().to_string() {
         return None;

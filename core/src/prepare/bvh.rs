@@ -135,30 +135,25 @@ impl<'a> BuildRange<'a> {
             _ => self.cheapest_split::<BINS>(),
         };
         let Self { primitives, first, leaves, .. } = self;
-        match split {
-            Some(split) => {
-                let (at, centers) = split.partition(primitives);
-                let [left, right] = split.sides;
-                let (before, behind) = primitives.split_at_mut(at);
-                let range = |primitives, first, bounds, centers| Self {
-                    primitives,
-                    first,
-                    bounds,
-                    centers,
-                    leaves,
-                };
-                [
-                    range(before, first, left, centers[0]),
-                    range(behind, first + at, right, centers[1]),
-                ]
-            }
+        let Some(split) = split else {
             // Nothing tells them apart.
-            None => {
-                let at = primitives.len() / 2;
-                let (before, behind) = primitives.split_at_mut(at);
-                [Self::new(before, first, leaves), Self::new(behind, first + at, leaves)]
-            }
-        }
+            let at = primitives.len() / 2;
+            let (before, behind) = primitives.split_at_mut(at);
+            return [Self::new(before, first, leaves), Self::new(behind, first + at, leaves)];
+        };
+        let (at, [left_centers, right_centers]) = split.partition(primitives);
+        let [left, right] = split.sides;
+        let (before, behind) = primitives.split_at_mut(at);
+        [
+            Self { primitives: before, first, bounds: left, centers: left_centers, leaves },
+            Self {
+                primitives: behind,
+                first: first + at,
+                bounds: right,
+                centers: right_centers,
+                leaves,
+            },
+        ]
     }
 
     /// The leaf, where the range is one.
