@@ -744,7 +744,7 @@ pub(crate) struct PriorityArgs {
     pub(crate) job: JobArgs,
 
     /// 0 is that of a job of which nothing is said.
-    #[arg(value_name = "N", allow_negative_numbers = true, value_parser = number::<i32>("a whole number"))]
+    #[arg(value_name = "N", allow_negative_numbers = true, value_parser = number::<i32>("a whole number of at most nine digits"))]
     pub(crate) priority: i32,
 }
 
@@ -873,9 +873,9 @@ impl PictureArgs {
 }
 
 /// What a prepared scene is to be good at.
-/// Reads a number; `wanted` says what is wanted where there is none.
+/// Reads a number; `wanted` says what it must be.
 fn number<T: FromStr>(wanted: &'static str) -> impl Fn(&str) -> Result<T, String> + Clone {
-    move |text| text.parse().map_err(|_| format!("{wanted}, is wanted"))
+    move |text| text.parse().map_err(|_| format!("it must be {wanted}"))
 }
 
 pub(crate) fn form(is_compact: bool) -> Form {

@@ -165,7 +165,7 @@ impl Bar {
         let Progress { tiles_done, tile_count, .. } = *progress;
         let filled = BAR_WIDTH * tiles_done as usize / tile_count.max(1) as usize;
         let (filled, empty) = ("█".repeat(filled), "░".repeat(BAR_WIDTH - filled));
-        let mut text = format!("{filled}{empty} {tiles_done}/{tile_count} tiles");
+        let mut speed = String::new();
         if tiles_done > 0 {
             let seconds = self.start.elapsed().as_secs_f64();
             let tiles_left = f64::from(tile_count - tiles_done);
@@ -177,9 +177,10 @@ impl Bar {
                 None => format!("{:.0}", seconds / f64::from(tiles_done) * tiles_left),
             };
             let mrays = progress.tally.rays as f64 / 1e6 / seconds;
-            text += &format!("  {mrays:.1} Mrays/s  {left} s left");
+            speed = format!("  {mrays:.1} Mrays/s  {left} s left");
         }
-        queue.show_bar(Some(text));
+        let bar = format!("{filled}{empty} {tiles_done}/{tile_count} tiles{speed}");
+        queue.show_bar(Some(bar));
     }
 }
 

@@ -60,12 +60,16 @@ impl Footer {
                     answers.flush()?;
                 }
                 Item::Leave(picture) => {
-                    picture.into_iter().for_each(|picture| self.draw(picture, &mut bytes));
+                    if let Some(picture) = picture {
+                        self.draw(picture, &mut bytes);
+                    }
                     self.picture = None;
                 }
             }
         }
-        picture.into_iter().for_each(|picture| self.draw(picture, &mut bytes));
+        if let Some(picture) = picture {
+            self.draw(picture, &mut bytes);
+        }
         self.has_bar = bar.is_some();
         bytes.extend(bar.into_iter().flat_map(|bar| {
             let fitting: String = bar.chars().take(columns).collect();

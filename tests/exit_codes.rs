@@ -121,11 +121,15 @@ fn nonsense_is_told_in_words_that_say_what_is_wanted() {
         (
             vec!["watch", "x", "--coordinator", farm],
             2,
-            "a job's number, as `rtfarm jobs` lists it, is",
+            "it must be a job's number, as `rtfarm jobs` lists it",
         ),
-        (vec!["explain", "1", "x", "--coordinator", farm], 2, "a tile's number, from 0, is wanted"),
-        (vec!["drain", "1.5", "--coordinator", farm], 2, "a worker's number, as `rtfarm workers`"),
-        (vec!["priority", "1", "high", "--coordinator", farm], 2, "a whole number, is wanted"),
+        (vec!["explain", "1", "x", "--coordinator", farm], 2, "it must be a tile's number, from 0"),
+        (
+            vec!["drain", "1.5", "--coordinator", farm],
+            2,
+            "it must be a worker's number, as `rtfarm workers`",
+        ),
+        (vec!["priority", "1", "high", "--coordinator", farm], 2, "it must be a whole number"),
         (
             vec!["report", "scene.rt", "--out", "scene.rt"],
             1,
