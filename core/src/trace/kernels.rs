@@ -308,7 +308,7 @@ mod tests {
 
     impl KernelWork<Four> for Option<FoundOnFour> {
         fn run(&mut self, (shear, corners): &Four, kernel: impl BoxKernel) {
-            let corners = corners.each_ref().map(|corners| corners.each_ref());
+            let corners = corners.each_ref().map(<[[f64; 3]; 3]>::each_ref);
             let mut distances = [0.0; FACES];
             let met = kernel.cross_four(shear, &corners, &mut distances);
             let bits =
