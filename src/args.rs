@@ -53,7 +53,8 @@ Examples:
   rtfarm worker --access farm/access/work &
   rtfarm submit scenes/gnome.rt -o gnome.png --access farm/access/submit
 
-Exit codes: 0 done, 1 failed, 2 the scene or the command line is wrong, 130 stopped by a signal.
+Exit codes: 0 done, 1 failed, 2 the command line or a file that it names to be read is wrong,
+130 stopped by a signal.
 Options that say what they are from the environment ([env: ...]) may be given there.";
 
 /// Options that say how much is told.
@@ -706,7 +707,7 @@ pub(crate) struct FarmArgs {
 #[derive(Debug, ClapArgs)]
 pub(crate) struct JobArgs {
     /// The job's number.
-    #[arg(value_name = "JOB")]
+    #[arg(value_name = "JOB", value_parser = number::<u64>("a job's number, as `rtfarm jobs` lists it"))]
     pub(crate) job: u64,
 
     #[command(flatten)]
@@ -719,14 +720,14 @@ pub(crate) struct ExplainArgs {
     pub(crate) job: JobArgs,
 
     /// The tile's number, as the log and the page have it.
-    #[arg(value_name = "TILE")]
+    #[arg(value_name = "TILE", value_parser = number::<u32>("a tile's number, from 0"))]
     pub(crate) tile: u32,
 }
 
 #[derive(Debug, ClapArgs)]
 pub(crate) struct WatchArgs {
     /// The job's number.
-    #[arg(value_name = "JOB")]
+    #[arg(value_name = "JOB", value_parser = number::<u64>("a job's number, as `rtfarm jobs` lists it"))]
     pub(crate) job: u64,
 
     #[command(flatten)]
@@ -743,14 +744,14 @@ pub(crate) struct PriorityArgs {
     pub(crate) job: JobArgs,
 
     /// 0 is that of a job of which nothing is said.
-    #[arg(value_name = "N", allow_negative_numbers = true)]
+    #[arg(value_name = "N", allow_negative_numbers = true, value_parser = number::<i32>("a whole number"))]
     pub(crate) priority: i32,
 }
 
 #[derive(Debug, ClapArgs)]
 pub(crate) struct StationArgs {
     /// The worker's number, as `rtfarm workers` lists it.
-    #[arg(value_name = "WORKER")]
+    #[arg(value_name = "WORKER", value_parser = number::<u32>("a worker's number, as `rtfarm workers` lists it"))]
     pub(crate) worker: u32,
 
     #[command(flatten)]
@@ -761,7 +762,7 @@ pub(crate) struct StationArgs {
 #[expect(clippy::struct_excessive_bools, reason = "each is a flag of its own")]
 pub(crate) struct ImageArgs {
     /// The job's number.
-    #[arg(value_name = "JOB")]
+    #[arg(value_name = "JOB", value_parser = number::<u64>("a job's number, as `rtfarm jobs` lists it"))]
     pub(crate) job: u64,
 
     /// Fetch what there is of a job that has not finished; what there is not is black.
@@ -872,6 +873,11 @@ impl PictureArgs {
 }
 
 /// What a prepared scene is to be good at.
+/// Reads a number; `wanted` says what is wanted where there is none.
+fn number<T: FromStr>(wanted: &'static str) -> impl Fn(&str) -> Result<T, String> + Clone {
+    move |text| text.parse().map_err(|_| format!("{wanted}, is wanted"))
+}
+
 pub(crate) fn form(is_compact: bool) -> Form {
     if is_compact { Form::Compact } else { Form::Fast }
 }

@@ -2,7 +2,7 @@
 
 use std::io::{self, Write};
 
-use anyhow::Context;
+use anyhow::{Context, anyhow};
 use rtfarm_core::{
     isa::Isa,
     language::{Diagnostic, Reading, Severity, draw_diagnostics, read_scene},
@@ -46,7 +46,7 @@ pub(crate) async fn run(
     };
     let (is_json, report, reading, findings) =
         checked.with_context(|| format!("cannot read the scene {name}"))?;
-    let is_valid = reading.scene.is_some();
+    let is_rendered = findings.as_ref().map(|findings| findings.prepared.clone().map(drop));
     let mut output = io::stdout().lock();
     let told = if is_json {
         let answer = answer(&name, &reading, findings.as_ref());
@@ -59,7 +59,11 @@ pub(crate) async fn run(
         findings.map_or(Ok(()), |findings| findings.tell(&name, &mut output))
     };
     told.context("cannot write to standard output")?;
-    if is_valid { Ok(()) } else { Err(Failure::Told) }
+    match is_rendered {
+        Some(Ok(())) => Ok(()),
+        Some(Err(reason)) => Err(Failure::Input(anyhow!("cannot render {name}: {reason}"))),
+        None => Err(Failure::Told),
+    }
 }
 
 /// What a valid scene holds and needs.
@@ -109,7 +113,7 @@ impl Findings {
             if words.is_empty() { "nothing".to_owned() } else { words.join(", ") }
         };
         let counts: Vec<String> =
-            self.counts.iter().map(|(noun, count)| format!("{count} {noun}")).collect();
+            self.counts.iter().map(|&(nouns, count)| counted(count, nouns)).collect();
         writeln!(
             output,
             "{name}: {}",
@@ -122,9 +126,19 @@ impl Findings {
         writeln!(output, "absent: {}", list(&self.absent))?;
         match &self.prepared {
             Ok(bytes) => writeln!(output, "prepared: {bytes} bytes, for kernel {}", Isa::fastest()),
-            Err(reason) => writeln!(output, "cannot be rendered: {reason}"),
+            Err(_) => Ok(()),
         }
     }
+}
+
+/// So many of something, whose name in the plural is given.
+fn counted(count: usize, nouns: &str) -> String {
+    let noun = match count {
+        1 if nouns == "meshes" => "mesh",
+        1 => nouns.trim_end_matches('s'),
+        _ => nouns,
+    };
+    format!("{count} {noun}")
 }
 
 /// The answer for machines.

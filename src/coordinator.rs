@@ -149,11 +149,17 @@ impl Place {
             None if address.is_ipv6() => format!("[{}]", address.ip()),
             None => address.ip().to_string(),
         };
-        let shown = Address::Tls(format!("{host}:{}", address.port()));
+        let shown = tls_address(&host, address.port())?;
         let security = Security::open(state, &shown).map_err(anyhow::Error::from)?;
         tracing::info!(folder = %state.join("access").display(), "access files are there");
         Ok((Listener::Tls(listener, security, args.limits()), shown))
     }
+}
+
+/// The address that others have of a coordinator.
+fn tls_address(host: &str, port: u16) -> Result<Address, Failure> {
+    let address = format!("https://{host}:{port}").parse().map_err(anyhow::Error::from);
+    address.map_err(Failure::Input)
 }
 
 /// What this machine calls itself.
@@ -164,8 +170,7 @@ fn own_name() -> String {
 /// `rtfarm certs`.
 pub(crate) fn make_certificates(args: &CertsArgs) -> Result<(), Failure> {
     let CertsArgs { state, name, port } = args;
-    let address = format!("https://{name}:{port}").parse().map_err(anyhow::Error::from);
-    let address = address.map_err(Failure::Input)?;
+    let address = tls_address(name, *port)?;
     fs::create_dir_all(state).with_context(|| format!("cannot make {}", state.display()))?;
     Security::open(state, &address).map_err(anyhow::Error::from)?;
     writeln!(io::stdout().lock(), "{}", state.join("access").display())
@@ -180,14 +185,11 @@ pub(crate) fn change_tokens(args: &TokensArgs) -> Result<(), Failure> {
         Holder::new(*role, owner.clone()).map_err(|reason| Failure::Input(anyhow!(reason)))?;
     let told = match change {
         TokenChange::Renew => {
-            let path = renew_token(state, &holder).map_err(anyhow::Error::from)?;
+            let path = renew_token(state, &holder).map_err(cannot_change)?;
             path.display().to_string()
         }
         TokenChange::Revoke => {
-            let others = revoke_token(state, &holder).map_err(|error| match error {
-                SecurityError::NoToken { .. } => Failure::Input(error.into()),
-                _ => Failure::Other(error.into()),
-            })?;
+            let others = revoke_token(state, &holder).map_err(cannot_change)?;
             match owner {
                 Some(owner) => format!("{owner} has no token to {role} any more"),
                 None if *role == Role::Submit && !others.is_empty() => {
@@ -201,6 +203,16 @@ pub(crate) fn change_tokens(args: &TokensArgs) -> Result<(), Failure> {
     };
     writeln!(io::stdout().lock(), "{told}").context("cannot write to standard output")?;
     Ok(())
+}
+
+/// Why tokens stay as they are.
+fn cannot_change(error: SecurityError) -> Failure {
+    match error {
+        SecurityError::None(_) | SecurityError::NoToken { .. } | SecurityError::Damaged(_) => {
+            Failure::Input(error.into())
+        }
+        SecurityError::Io(..) | SecurityError::Certificate(_) => Failure::Other(error.into()),
+    }
 }
 
 /// Opens the state in a folder, which reads the pictures under way there.

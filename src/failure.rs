@@ -13,7 +13,7 @@ pub(crate) const INTERRUPTED: u8 = 130;
 /// Why a command did not do what it was asked to.
 #[derive(Debug)]
 pub(crate) enum Failure {
-    /// The command line or the scene is wrong.
+    /// The command line is wrong, or something that it names to be read.
     Input(anyhow::Error),
     /// The scene is wrong, and its diagnostics have said why.
     Told,

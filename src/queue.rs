@@ -73,14 +73,14 @@ impl Answer {
     }
 }
 
-/// Writes one JSON document, or a text without control characters.
+/// One JSON document, or a text without control characters.
+pub(crate) fn answer(as_json: bool, json: &Value, text: &str) -> String {
+    if as_json { format!("{json:#}") } else { plain(text).trim_end().to_owned() }
+}
+
+/// Writes it to standard output.
 pub(crate) fn tell(as_json: bool, json: &Value, text: &str) -> Result<(), Failure> {
-    let mut output = io::stdout().lock();
-    let told = if as_json {
-        writeln!(output, "{json:#}")
-    } else {
-        writeln!(output, "{}", plain(text).trim_end())
-    };
+    let told = writeln!(io::stdout().lock(), "{}", answer(as_json, json, text));
     Ok(told.context("cannot write to standard output")?)
 }
 
@@ -373,18 +373,22 @@ pub(crate) async fn watch(
         last = follow(&args, &access, console) => last?,
         () = stop.cancelled() => return Err(Failure::Interrupted),
     };
+    let tell = |json: &Value, text: &str| {
+        let told = console.answer(&answer(args.farm.json, json, text));
+        told.context("cannot write to standard output")
+    };
     let mut json = progress_json(&last);
     json["job"] = args.job.to_string().into();
     match last.end {
         Some(event::End::Finished(wire::Finished { seconds })) => {
             json["state"] = "finished".into();
             json["seconds"] = seconds.into();
-            tell(args.farm.json, &json, &format!("job {} finished in {seconds:.2} s", args.job))
+            Ok(tell(&json, &format!("job {} finished in {seconds:.2} s", args.job))?)
         }
         Some(event::End::Failed(reason)) => {
             json["state"] = "failed".into();
             if args.farm.json {
-                tell(true, &json, "")?;
+                tell(&json, "")?;
             }
             Err(anyhow!("the job failed: {}", plain(&reason)).into())
         }

@@ -2,8 +2,10 @@
 //! itself. Its picture at many samples stands for the truth.
 
 use std::{
+    fs,
     io::{self, Write},
     ops::ControlFlow,
+    path::Path,
 };
 
 use anyhow::{Context, anyhow};
@@ -31,6 +33,12 @@ pub(crate) async fn run(
     stop: &CancellationToken,
 ) -> Result<(), Failure> {
     let (scene, effort) = (args.scene(), args.effort);
+    let in_place = |folder: &Path| format!("cannot write into the folder {}", folder.display());
+    if let Some(folder) = &args.out {
+        // Nobody waits for a report that has no place.
+        fs::create_dir_all(folder).with_context(|| in_place(folder))?;
+        tempfile::tempfile_in(folder).with_context(|| in_place(folder))?;
+    }
     let (prepared, full_size) = read(&scene, console, stop).await?;
     let (name, token) = (scene.name(), stop.clone());
     let measuring = spawn_blocking(move || {
@@ -44,9 +52,7 @@ pub(crate) async fn run(
     let ladder = measuring.await?.ok_or(Failure::Interrupted)?;
     let report = Report::on_scene(&ladder, args.wanted)?;
     match args.out {
-        Some(folder) => report
-            .write(&folder)
-            .with_context(|| format!("cannot write into the folder {}", folder.display()))?,
+        Some(folder) => report.write(&folder).with_context(|| in_place(&folder))?,
         None => io::stdout()
             .lock()
             .write_all(report.text.as_bytes())

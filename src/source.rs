@@ -19,6 +19,9 @@ use crate::{args::SceneArgs, failure::Failure, scene_files::SceneFiles};
 /// From here on a copy would count.
 const LONG: u64 = 16 << 20;
 
+/// The longest text of a device or a pipe: one that has no end is not waited for.
+const LONGEST_STREAM: u64 = 4 << 30;
+
 /// A scene's text, in memory or mapped.
 #[derive(Debug)]
 pub(crate) enum SceneText {
@@ -45,8 +48,7 @@ impl SceneText {
         let (path, is_from_stdin) = (scene.path.clone(), scene.is_from_stdin());
         let read = spawn_blocking(move || {
             if is_from_stdin {
-                let mut text = Vec::new();
-                io::stdin().lock().read_to_end(&mut text).map(|_| Self::Copied(text))
+                read_stream(io::stdin().lock(), LONGEST_STREAM).map(Self::Copied)
             } else {
                 Self::open(&path)
             }
@@ -55,7 +57,8 @@ impl SceneText {
             text = read => text?,
             () = stop.cancelled() => return Err(Failure::Interrupted),
         };
-        Ok(text.with_context(|| format!("cannot read the scene {}", scene.name()))?)
+        let text = text.with_context(|| format!("cannot read the scene {}", scene.name()));
+        text.map_err(Failure::Input)
     }
 
     #[expect(unsafe_code, reason = "a map is as good as what is known about its file")]
@@ -64,10 +67,10 @@ impl SceneText {
         if metadata.is_dir() {
             return Err(io::Error::other("it is a folder"));
         }
-        if !metadata.is_file() || metadata.len() < LONG {
-            return fs::read(path).map(Self::Copied);
-        }
         let file = File::open(path)?;
+        if !metadata.is_file() || metadata.len() < LONG {
+            return read_stream(file, LONGEST_STREAM).map(Self::Copied);
+        }
         let state = FileState::new(&file.metadata()?);
         // SAFETY: the bytes are only ever read, by a reader that takes any bytes whatever and holds
         // no assumption about them from one look to the next; that nobody wrote to the file in
@@ -86,6 +89,16 @@ impl SceneText {
             _ => Ok(()),
         }
     }
+}
+
+/// Reads all of it, which is at most so many bytes.
+fn read_stream(stream: impl Read, most: u64) -> io::Result<Vec<u8>> {
+    let mut text = Vec::new();
+    if stream.take(most + 1).read_to_end(&mut text)? as u64 > most {
+        let gigabytes = most >> 30;
+        return Err(io::Error::other(format!("it goes on after {gigabytes} GiB, and is no file")));
+    }
+    Ok(text)
 }
 
 impl std::ops::Deref for SceneText {
@@ -142,6 +155,13 @@ mod tests {
         let read = read_named_files(text.as_bytes(), &files);
         let expected = ["teapot.obj", "wood.png"].map(|name| (name.to_owned(), name.into()));
         assert_eq!(read, BTreeMap::from(expected));
+    }
+
+    #[test]
+    fn a_stream_without_an_end_is_refused() {
+        assert_eq!(read_stream(&b"text"[..], 4).unwrap(), b"text");
+        let endless = read_stream(io::repeat(b' '), 1 << 20).unwrap_err();
+        assert!(endless.to_string().starts_with("it goes on"), "{endless}");
     }
 
     #[test]

@@ -7,6 +7,7 @@ use std::{
     sync::Arc,
 };
 
+use anyhow::Context;
 use rtfarm_client::{Ended, Finished, JobState, Order, Outside, Trouble};
 use rtfarm_core::prepare::Form;
 use rtfarm_job::{Progress, TimeLeft};
@@ -14,7 +15,7 @@ use rtfarm_proto::{
     Access, CHUNK_BYTES, ConnectError, JobId, MESSAGE_BYTES, PROTOCOL, Reached,
     wire::{self, jobs_client::JobsClient, submit_request::Part},
 };
-use serde_json::json;
+use serde_json::{Value, json};
 use tokio::{sync::mpsc, task::spawn_blocking, time::Instant};
 use tokio_stream::{Stream, wrappers::ReceiverStream};
 use tokio_util::sync::CancellationToken;
@@ -55,6 +56,11 @@ pub(crate) async fn run(
         Here { args: &args, access, output: &output, console, stop, key, text, bar: None };
     let ended = rtfarm_client::run(&mut here, order, stop).await.map_err(Failure::of_client);
 
+    // The bar that is taken away shares the terminal.
+    let tell = |json: &Value, text: &str| {
+        let told = console.answer(&queue::answer(args.json, json, text));
+        Ok(told.context("cannot write to standard output")?)
+    };
     let (job, finished) = match ended? {
         Ended::Finished(job, finished) => (job, finished),
         Ended::Detached(job, size) => {
@@ -62,7 +68,7 @@ pub(crate) async fn run(
             let json = json!({
                 "job": job.to_string(), "width": size.width(), "height": size.height(),
             });
-            return queue::tell(args.json, &json, &job.to_string());
+            return tell(&json, &job.to_string());
         }
     };
     let Finished { size, tally, worker_count, hosts, rendering } = finished;
@@ -81,7 +87,7 @@ pub(crate) async fn run(
         json["rays"] = tally.rays.into();
         json["samples"] = tally.samples.into();
         json["error"] = tally.error().into();
-        return queue::tell(true, &json, "");
+        return tell(&json, "");
     }
     Ok(summary.tell(started, &output, console)?)
 }
@@ -122,9 +128,9 @@ impl Outside for Here<'_> {
     ) -> impl Future<Output = Result<JobsClient<Reached>, Trouble>> + Send + 'static {
         let access = self.access.clone();
         async move {
-            let reached = reach(&access).await.map_err(anyhow::Error::from);
+            let reached = reach(&access).await;
             let address = access.address().clone();
-            reached.map_err(|error| Trouble::Connect(address, format!("{error:#}")))
+            reached.map_err(|error| Trouble::Connect(address, error.to_string()))
         }
     }
 

@@ -2,9 +2,14 @@
 
 use std::{
     fs,
+    net::TcpListener,
     path::{Path, PathBuf},
-    process::{Command, Output},
+    process::{Child, Command, Output},
+    thread,
+    time::Duration,
 };
+
+use rustix::process::{Pid, Signal, kill_process};
 
 fn root() -> &'static Path {
     Path::new(env!("CARGO_MANIFEST_DIR"))
@@ -45,6 +50,106 @@ fn the_units_are_well_formed_and_open_to_little() {
             assert!(output.status.success(), "{words:?} {}: {output:?}", unit.display());
         }
     }
+}
+
+/// A machine of its own, whose first process is systemd, and the units that are started there.
+struct Machine {
+    script: Child,
+    folder: tempfile::TempDir,
+}
+
+impl Drop for Machine {
+    fn drop(&mut self) {
+        let _ = kill_process(Pid::from_child(&self.script), Signal::TERM);
+        let _ = self.script.wait();
+    }
+}
+
+impl Machine {
+    /// `None` where the user or the machine cannot run one.
+    fn start(units: &[PathBuf], port: u16) -> Option<Self> {
+        let mounts = fs::read_to_string("/proc/mounts").unwrap_or_default();
+        let is_able = rustix::process::geteuid().is_root()
+            && Path::new("/lib/systemd/systemd").exists()
+            && mounts.lines().any(|mount| mount.starts_with("cgroup2 "));
+        if !is_able {
+            eprintln!("SKIPPED: units are started by root, with systemd and cgroup2");
+            return None;
+        }
+        let folder = tempfile::tempdir().unwrap();
+        for name in ["bin", "etc", "lib"] {
+            fs::create_dir(folder.path().join(name)).unwrap();
+        }
+        fs::copy(env!("CARGO_BIN_EXE_rtfarm"), folder.path().join("bin/rtfarm")).unwrap();
+        let listen = format!("RTFARM_LISTEN=127.0.0.1:{port}\n");
+        fs::write(folder.path().join("etc/coordinator"), listen).unwrap();
+        let mut command = Command::new(root().join("tests/systemd-machine"));
+        let script = command.arg(folder.path()).args(units).spawn().unwrap();
+        Some(Self { script, folder })
+    }
+
+    /// The process that a unit has now.
+    fn process(&self, unit: &str) -> Option<Pid> {
+        let group = format!("/rtfarm.{}/system.slice/{unit}\n", self.script.id());
+        let processes = fs::read_dir("/proc").unwrap().filter_map(Result::ok);
+        let mut numbers = processes.filter_map(|entry| entry.file_name().to_str()?.parse().ok());
+        let number = numbers.find(|number: &i32| {
+            let found = fs::read_to_string(format!("/proc/{number}/cgroup")).unwrap_or_default();
+            found.ends_with(&group)
+        });
+        number.and_then(Pid::from_raw)
+    }
+}
+
+/// Asks until there is an answer.
+fn poll<T>(mut ask: impl FnMut() -> Option<T>) -> T {
+    for _ in 0..1200 {
+        if let Some(answer) = ask() {
+            return answer;
+        }
+        thread::sleep(Duration::from_millis(50));
+    }
+    panic!("nothing happened for a minute");
+}
+
+#[test]
+#[ignore = "needs root and systemd; .ci/run runs it"]
+fn units_are_started_by_systemd_as_they_are_and_come_back_when_they_are_killed() {
+    let units = ["rtfarm-coordinator.service", "rtfarm-worker.service"];
+    let files = units.map(|unit| root().join("deploy/systemd").join(unit));
+    let port = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
+    let Some(machine) = Machine::start(&files, port) else { return };
+    let place = |name: &str| machine.folder.path().join(name);
+    let access = |role: &str| place("lib/private/rtfarm/access").join(role);
+    poll(|| access("submit").exists().then_some(()));
+    // The worker starts again and again until it has it.
+    fs::copy(access("work"), place("etc/work")).unwrap();
+    let ask = |words: &[&str], role: &str| {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_rtfarm"));
+        let output = command.args(words).arg("--access").arg(access(role)).output().unwrap();
+        output.status.success().then(|| String::from_utf8(output.stdout).unwrap())
+    };
+    let scene = root().join("scenes/lights.rt");
+    let picture = |name: &str| {
+        let out = place(name).to_str().unwrap().to_owned();
+        let words = ["submit", scene.to_str().unwrap(), "-o", &out, "--size", "96x64"];
+        poll(|| ask(&words, "submit"));
+        fs::read(out).unwrap()
+    };
+    let has_worker =
+        || ask(&["workers", "--json"], "read").is_some_and(|said| said.contains("host"));
+    poll(|| has_worker().then_some(()));
+    let first = picture("first.png");
+    for unit in units {
+        let killed = machine.process(unit).unwrap();
+        kill_process(killed, Signal::KILL).unwrap();
+        poll(|| machine.process(unit).filter(|process| *process != killed));
+    }
+    assert!(picture("second.png") == first);
+    let mut here = Command::new(env!("CARGO_BIN_EXE_rtfarm"));
+    let words = ["render", "--size", "96x64", "--workers", "0", "--quiet", "-o"];
+    assert!(here.args(words).arg(place("here.png")).arg(&scene).status().unwrap().success());
+    assert!(fs::read(place("here.png")).unwrap() == first);
 }
 
 /// The folder with the program that needs nothing of its system; `deploy/Containerfile` says how it is

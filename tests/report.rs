@@ -45,7 +45,7 @@ fn a_report_on_nothing_says_so() {
     let output = report(folder.path(), &[]);
     assert_eq!(output.status.code(), Some(2));
     let output = report(folder.path(), &["missing.rt"]);
-    assert_eq!(output.status.code(), Some(1));
+    assert_eq!(output.status.code(), Some(2));
     let told = String::from_utf8(output.stderr).unwrap();
     assert!(told.contains("cannot read the scene missing.rt"), "{told}");
 }

@@ -21,9 +21,9 @@ use rtfarm_proto::{
 };
 use rtfarm_worker::simulation::{Outside, run_in};
 use tempfile::TempDir;
-use tokio::net::TcpListener;
+use tokio::{net::TcpListener, task::JoinHandle, time::Instant};
 use tonic::{
-    Code,
+    Code, Response, Status,
     body::Body,
     codegen::{Service, http},
     transport::Channel,
@@ -105,6 +105,29 @@ impl Farm {
         }
     }
 
+    /// Sends a scene whose preparing takes a while; answers with the call, and when all was sent.
+    async fn begin_long_scene(
+        &self,
+    ) -> (JoinHandle<Result<Response<wire::SubmitResponse>, Status>>, Instant) {
+        let (send, receive) = tokio::sync::mpsc::channel(1);
+        let mut jobs = self.jobs.clone();
+        let stream = tokio_stream::wrappers::ReceiverStream::new(receive);
+        let submitting = tokio::spawn(async move { jobs.submit(stream).await });
+        let text = long_scene();
+        let pieces = text.as_bytes().chunks(1 << 20).map(|piece| Part::Text(piece.to_vec().into()));
+        for part in std::iter::once(Part::Order(order(VERSION))).chain(pieces) {
+            send.send(wire::SubmitRequest { part: Some(part) }).await.unwrap();
+        }
+        (submitting, Instant::now())
+    }
+
+    /// Cancels a job that was accepted.
+    async fn cancel(&mut self, answer: wire::SubmitResponse) {
+        let Some(Outcome::Accepted(accepted)) = answer.outcome else { panic!("{answer:?}") };
+        let request = wire::CancelRequest { job: accepted.job, farm: accepted.farm };
+        assert!(self.jobs.cancel(request).await.unwrap().into_inner().was_known);
+    }
+
     /// Renders the job.
     async fn finish(&mut self) {
         while self.state().await.end.is_none() {
@@ -117,13 +140,8 @@ impl Farm {
 
     /// Has a scene of some megabytes be the farm's next job.
     async fn submit_long_scene(&mut self) {
-        let text = long_scene();
-        let pieces = text.as_bytes().chunks(1 << 20).map(|piece| Part::Text(piece.to_vec().into()));
-        let parts: Vec<_> = std::iter::once(Part::Order(order(VERSION)))
-            .chain(pieces)
-            .map(|part| wire::SubmitRequest { part: Some(part) })
-            .collect();
-        let answer = self.jobs.submit(tokio_stream::iter(parts)).await.unwrap().into_inner();
+        let (submitting, _) = self.begin_long_scene().await;
+        let answer = submitting.await.unwrap().unwrap().into_inner();
         let Some(Outcome::Accepted(accepted)) = answer.outcome else { panic!("{answer:?}") };
         self.job = accepted.job;
     }
@@ -389,20 +407,20 @@ async fn a_client_that_goes_while_its_scene_is_prepared_leaves_no_job() {
             break;
         }
     }
-    let (send, receive) = tokio::sync::mpsc::channel(1);
-    let mut jobs = farm.jobs.clone();
-    let stream = tokio_stream::wrappers::ReceiverStream::new(receive);
-    let submitting = tokio::spawn(async move { jobs.submit(stream).await });
-    let text = long_scene();
-    let pieces = text.as_bytes().chunks(1 << 20).map(|piece| Part::Text(piece.to_vec().into()));
-    for part in std::iter::once(Part::Order(order(VERSION))).chain(pieces) {
-        send.send(wire::SubmitRequest { part: Some(part) }).await.unwrap();
+    // How long the farm prepares a scene that it has: half of it later it still does, or a quarter.
+    let (mut submitting, sent) = farm.begin_long_scene().await;
+    let answer = (&mut submitting).await.unwrap().unwrap().into_inner();
+    let mut delay = sent.elapsed() / 2;
+    farm.cancel(answer).await;
+    loop {
+        (submitting, _) = farm.begin_long_scene().await;
+        tokio::time::sleep(delay).await;
+        if !submitting.is_finished() {
+            break submitting.abort();
+        }
+        farm.cancel(submitting.await.unwrap().unwrap().into_inner()).await;
+        delay /= 2;
     }
-    drop(send);
-    // The text is on its way and will have come before the end of the call does.
-    tokio::time::sleep(Duration::from_millis(30)).await;
-    assert!(!submitting.is_finished(), "the scene is being prepared");
-    submitting.abort();
     let request = wire::LeaseRequest {
         worker: farm.worker,
         incarnation: farm.incarnation,

@@ -2,6 +2,7 @@
 //! token that says what the caller may do. An access file has all three.
 
 use std::{
+    error::Error,
     fmt, fs,
     path::PathBuf,
     sync::Arc,
@@ -52,11 +53,22 @@ pub struct AccessError;
 #[derive(Debug, thiserror::Error)]
 pub enum ConnectError {
     /// Nobody answers, or not as who is expected.
-    #[error(transparent)]
-    Transport(#[from] tonic::transport::Error),
+    #[error("{0}")]
+    Transport(String),
     /// The address is one of TLS, and nobody vouches for it.
     #[error("an address with https:// needs an access file, which --access FILE names")]
     NoAuthority,
+}
+
+impl From<tonic::transport::Error> for ConnectError {
+    /// Keeps the innermost reason: those around it say the same again, or nothing.
+    fn from(error: tonic::transport::Error) -> Self {
+        let mut reason: &dyn Error = &error;
+        while let Some(source) = reason.source() {
+            reason = source;
+        }
+        Self::Transport(reason.to_string())
+    }
 }
 
 impl From<Address> for Access {

@@ -207,7 +207,7 @@ fn an_interruption_while_the_terminal_is_asked_leaves_it_as_it_was() {
 fn a_terminal_is_asked_once_the_scene_is_found_good() {
     let (place, terminal) = (Place::new(), Terminal::new(""));
     let mut command = render(&place, "missing.rt", &terminal.inside);
-    assert_eq!(command.status().unwrap().code(), Some(1));
+    assert_eq!(command.status().unwrap().code(), Some(2));
     drop((command, terminal.inside));
     let said = String::from_utf8(terminal.reading.join().unwrap()).unwrap();
     assert!(said.contains("missing.rt") && !said.contains("\x1b[c"), "{said:?}");
@@ -246,4 +246,36 @@ fn a_terminal_that_is_stopped_or_that_nobody_reads_holds_nothing_up() {
         assert!(place.path("out.png").exists(), "{options:?}");
         place.check_nothing_is_left();
     }
+}
+
+#[test]
+fn the_bar_is_gone_where_watch_says_that_its_job_has_ended() {
+    let place = Place::new();
+    let listen = ["coordinator", "--listen", "127.0.0.1:0", "--insecure"];
+    let mut coordinator = place.start("coordinator.log", &listen);
+    let line = coordinator.read_line();
+    let farm = ["--coordinator", line.trim().strip_prefix("listening on ").unwrap()];
+    let order = ["submit", "scene.rt", "-o", "out.png", "--size", "160x120", "--detach"];
+    let mut submit = place.start("submit.log", &[&order[..], &farm].concat());
+    let job = submit.read_line();
+    let Terminal { inside, reading } = Terminal::new("");
+    // Nobody else keeps the inside once it has ended.
+    let mut watch = Command::new(env!("CARGO_BIN_EXE_rtfarm"));
+    watch
+        .args(["watch", job.trim()])
+        .args(farm)
+        .env("TERM", "xterm")
+        .env_remove("RUST_LOG")
+        .stdin(Stdio::null())
+        .stdout(inside.try_clone().unwrap())
+        .stderr(inside);
+    let mut watching = watch.spawn().unwrap();
+    drop(watch);
+    let _worker = place.start("worker.log", &[&["worker"], &farm[..]].concat());
+    assert!(watching.wait().unwrap().success());
+    let said = String::from_utf8(reading.join().unwrap()).unwrap();
+    let (before, after) = said.split_once(&format!("job {} finished", job.trim())).expect(&said);
+    let line = before.rsplit('\n').next().unwrap();
+    assert!(line.is_empty() || line.ends_with("\r\x1b[K"), "{said:?}");
+    assert!(after.ends_with(" s\r\n"), "nothing follows: {said:?}");
 }

@@ -1,13 +1,13 @@
 //! A farm that others can reach: who may come, and what becomes of those who may not.
 
 use std::{
-    io::{Read, Write},
+    io::{ErrorKind, Read, Write},
     os::unix::fs::PermissionsExt,
 };
 
 use rtfarm_proto::{
-    Access, MESSAGE_BYTES,
-    wire::{self, farm_client::FarmClient},
+    Access, CHUNK_BYTES, MESSAGE_BYTES,
+    wire::{self, farm_client::FarmClient, jobs_client::JobsClient},
 };
 
 use super::*;
@@ -32,13 +32,23 @@ fn ask(place: &Place, words: &[&str]) -> (Option<i32>, String) {
     (code, said)
 }
 
-/// Has one who has a token send messages that are too long.
-fn flood(access: &Path) -> thread::JoinHandle<()> {
-    let access = Access::read(&fs::read_to_string(access).unwrap()).unwrap();
+/// Has those who have tokens send messages that are too long.
+fn flood(place: &Place) -> thread::JoinHandle<()> {
+    let [work, submit] = ["work", "submit"].map(|role| {
+        let access = place.path("farm/access").join(role);
+        Access::read(&fs::read_to_string(access).unwrap()).unwrap()
+    });
     thread::spawn(move || {
         let runtime = tokio::runtime::Runtime::new().unwrap();
         runtime.block_on(async {
-            let mut client = FarmClient::new(access.connect().await.unwrap());
+            let mut client = JobsClient::new(submit.connect().await.unwrap());
+            for length in [CHUNK_BYTES + (1 << 16), MESSAGE_BYTES] {
+                let part = Some(wire::submit_request::Part::Text(vec![0; length].into()));
+                let stream = tokio_stream::iter([wire::SubmitRequest { part }]);
+                let status = client.submit(stream).await.unwrap_err();
+                assert!(status.message().contains("message length too large"), "{status}");
+            }
+            let mut client = FarmClient::new(work.connect().await.unwrap());
             for length in [MESSAGE_BYTES, 2 * MESSAGE_BYTES, 8 * MESSAGE_BYTES] {
                 let pixels = vec![0; length].into();
                 let tiles = vec![wire::FinishedTile { pixels, ..Default::default() }];
@@ -256,11 +266,12 @@ fn a_farm_serves_those_who_have_a_token_while_others_storm_it() {
                     thread::sleep(Duration::from_millis(50));
                 }
                 // It is sent away: this ends before its patience does.
-                let _ = stream.read_to_end(&mut Vec::new());
+                let end = stream.read_to_end(&mut Vec::new()).map_err(|error| error.kind());
+                assert_ne!(end, Err(ErrorKind::WouldBlock), "{number} is still there");
             })
         })
         .collect();
-    let flood = flood(&place.path("farm/access/work"));
+    let flood = flood(&place);
     assert!(submit.wait().success(), "{}", submit.log());
     assert!(fs::read(place.path("out.png")).unwrap() == here);
     flood.join().unwrap();
@@ -342,7 +353,7 @@ fn who_has_no_token_or_that_of_another_role_or_farm_is_refused_and_told_why() {
     check_refused(
         &place,
         &["tokens", "renew", "read", "--state", "tmp"],
-        1,
+        2,
         "there are no tokens in",
     );
 }

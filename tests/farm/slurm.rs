@@ -59,9 +59,14 @@ impl Cluster {
         queue.lines().map(|line| line.trim().to_owned()).collect()
     }
 
+    /// Renders `PICTURE` with these options of Slurm's and more of `render`.
     fn render(&self, place: &Place, options: &str, more: &[&str]) -> Process {
+        self.render_of(place, options, &[&PICTURE[..], more].concat())
+    }
+
+    fn render_of(&self, place: &Place, options: &str, picture: &[&str]) -> Process {
         let args = ["render", "scene.rt", "-o", "out.png", "--slurm-host", "127.0.0.1", "--slurm"];
-        let args = [&args[..], &[options], &PICTURE, more].concat();
+        let args = [&args[..], &[options], picture].concat();
         place.start_by(&["env".to_owned(), self.configuration()], "render.log", &args)
     }
 }
@@ -133,18 +138,71 @@ fn slurm_renders_the_same_bytes_though_tasks_are_cancelled_queued_again_preempte
 fn a_worker_that_slurm_asks_to_end_delivers_what_it_has() {
     let Some(cluster) = Cluster::start() else { return };
     let place = Place::new();
-    // Slurm's shortest time is a minute.
-    let mut render = cluster.render(&place, "--array=1-2 --time=1 --signal=B:TERM@55", &[]);
-    await_work(&render, 2, 4);
-    cluster.run(&["scancel", "--batch", "--signal=TERM", "1_1"]);
-    poll(|| (!cluster.queue().iter().any(|task| task.starts_with("1_1 "))).then_some(()));
-    // It says so itself, and gives back what it has not begun.
-    let log = render.log();
-    let lost: Vec<&str> = log.lines().filter(|line| line.contains("lease lost")).collect();
-    assert!(lost.iter().all(|line| line.contains("the worker was stopped")), "{lost:?}");
-    cluster.run(&["scancel", "1"]);
-    assert_eq!(render.wait().code(), Some(1));
-    assert!(render.log().contains("no worker of Slurm's job 1 is left"), "{}", render.log());
+    // Asked for by hand, and by the signal that Slurm sends before a task's time is over: that is a minute
+    // at least, and it comes 55 s before its end, be the worker there yet or not.
+    for (job, options, by_hand) in
+        [("1", "--array=1-1", true), ("2", "--array=1-1 --time=1 --signal=B:TERM@55", false)]
+    {
+        // One that no machine renders in seconds.
+        let picture = ["--size", "2048x2048", "--samples", "512", "--tile", "8"];
+        let mut render = cluster.render_of(&place, options, &picture);
+        if by_hand {
+            await_work(&render, 1, 4);
+            cluster.run(&["scancel", "--batch", "--signal=TERM", &format!("{job}_1")]);
+        }
+        assert_eq!(render.wait().code(), Some(1), "{options}: {}", render.log());
+        // It says so itself, and gives back what it has not begun.
+        let log = render.log();
+        let lost: Vec<&str> = log.lines().filter(|line| line.contains("lease lost")).collect();
+        assert!(lost.iter().all(|line| line.contains("the worker was stopped")), "{lost:?}");
+        assert!(log.contains(&format!("no worker of Slurm's job {job} is left")), "{log}");
+    }
+}
+
+#[test]
+#[ignore = "needs root and Slurm; .ci/run runs it"]
+fn a_coordinator_that_slurm_queues_again_on_another_node_is_found_there() {
+    let Some(cluster) = Cluster::start() else { return };
+    let place = Place::new();
+    let submit_job = |script: &str, options: &[&str], args: &[&str]| {
+        let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("deploy/slurm").join(script);
+        let folder = format!("--chdir={}", place.folder.path().display());
+        // Each start listens on another port.
+        let words = ["RTFARM_LISTEN=0.0.0.0:0", "sbatch", "--parsable", &folder];
+        let program = [script.to_str().unwrap(), env!("CARGO_BIN_EXE_rtfarm")];
+        cluster.run(&[&words[..], options, &program, args].concat()).trim().to_owned()
+    };
+    let coordinator = submit_job("coordinator.sh", &["--output=coordinator.log"], &["farm"]);
+    let running = format!("{coordinator} RUNNING ");
+    let node = || {
+        poll(|| {
+            cluster.queue().iter().find_map(|job| job.strip_prefix(&running).map(str::to_owned))
+        })
+    };
+    let first = node();
+    let elsewhere = format!("--exclude={first}");
+    let options = ["--array=1-2", "--cpus-per-task=2", "--output=worker.%a.log", &elsewhere];
+    submit_job("worker.sh", &options, &["farm/access/work"]);
+    poll(|| place.path("farm/access/submit").exists().then_some(()));
+    // Nodes alone know each other by their names.
+    let srun = ["env".to_owned(), cluster.configuration(), "srun".to_owned(), elsewhere];
+    let order = ["submit", "scene.rt", "-o", "out.png", "--access", "farm/access/submit"];
+    let mut submit = place.start_by(&srun, "submit.log", &[&order[..], &PICTURE].concat());
+    let log = || fs::read_to_string(place.path("coordinator.log")).unwrap_or_default();
+    poll(|| (finished_tiles(&log()).len() >= 8).then_some(()));
+    let before = finished_tiles(&log()).len();
+    cluster.manage("cut", Some(&first));
+    assert!(submit.wait().success(), "{}", submit.log());
+    let second = node();
+    assert_ne!(first, second);
+    for node in [&first, &second] {
+        assert!(log().contains(&format!("listening on https://{node}:")), "{node}: {}", log());
+    }
+    assert!(before < SLOW_TILE_COUNT && finished_tiles(&log()).len() >= SLOW_TILE_COUNT - 8);
+    let here = place.render("here.png", &[&PICTURE[..], &["--workers", "0"]].concat());
+    assert!(fs::read(place.path("out.png")).unwrap() == here);
+    cluster.run(&["scancel", "--batch", "--signal=TERM", &coordinator]);
+    poll(|| cluster.queue().is_empty().then_some(()));
 }
 
 #[test]

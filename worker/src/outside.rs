@@ -1,6 +1,6 @@
 //! What a worker reaches the world by: the network and threads, or what a simulation puts there.
 
-use std::{error::Error, panic::resume_unwind};
+use std::panic::resume_unwind;
 
 use rayon::{ThreadPool, ThreadPoolBuildError, ThreadPoolBuilder};
 use rtfarm_proto::{Access, Connection, Reached};
@@ -46,13 +46,7 @@ impl Outside for Machine {
     type Connection = Reached;
 
     async fn connect(&self, access: &Access) -> Result<Reached, String> {
-        access.connect().await.map_err(|error| {
-            let mut reason: &dyn Error = &error;
-            while let Some(source) = reason.source() {
-                reason = source;
-            }
-            reason.to_string()
-        })
+        access.connect().await.map_err(|error| error.to_string())
     }
 
     fn render(&self, work: impl FnOnce(Instant) + Send + 'static) {

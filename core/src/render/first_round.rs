@@ -120,15 +120,13 @@ impl InLanes<'_> {
                 contrasts[channel][lane] = contrast;
                 edges[channel][lane] = colors.iter().fold(true, |is_edge, color| {
                     let inside = (color - low).min(low + contrast - color);
-                    is_edge & (SHADES * inside <= contrast)
+                    is_edge && SHADES * inside <= contrast
                 });
                 variances[channel][lane] = variance_about_plane(&colors);
             }
         }
         for lane in 0..AT_ONCE {
-            let is_even = (contrasts[0][lane] == 0.0)
-                & (contrasts[1][lane] == 0.0)
-                & (contrasts[2][lane] == 0.0);
+            let is_even = contrasts.iter().all(|lanes| lanes[lane] == 0.0);
             let middle = self.wide.index_of(x, y) as usize + lane;
             for channel in 0..3 {
                 let variance = if is_even { 0.0 } else { variances[channel][lane] };
