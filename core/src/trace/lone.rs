@@ -7,7 +7,7 @@ use super::{
     box_ray::BoxRay,
     boxes::BoxKernel,
     lanes::FACES,
-    packet::Meeting,
+    meeting::Meeting,
     ray::{Ray, Shear},
     traversal::Traversal,
 };

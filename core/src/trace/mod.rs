@@ -15,6 +15,7 @@ pub(crate) mod kernels;
 mod lane_faces;
 mod lanes;
 mod lone;
+mod meeting;
 mod packet;
 mod parallelepiped;
 #[cfg(target_arch = "x86_64")]

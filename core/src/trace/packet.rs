@@ -15,6 +15,7 @@ use super::{
     lane_faces::{cross_plane, cross_sphere, cross_sphere_again, leaves, pass_quadrangle},
     lanes::{Beam, GROUPS, LANES, MOST_RAYS, RayGroup, Turn, larger, shear_at},
     lone::step,
+    meeting::Meeting,
     ray::{Ray, Shear},
     traversal::{STACK, Stack, Step},
 };
@@ -47,26 +48,6 @@ impl Default for PacketStack {
     fn default() -> Self {
         Self([(0.0, Child::NONE, 0); STACK], Node::EMPTY)
     }
-}
-
-/// What is done with what rays of a packet meet.
-pub(super) trait Meeting {
-    /// The ray at a place in the packet crosses a triangle at a distance, before or behind its start.
-    fn cross(&mut self, place: usize, item: Item, t: f64) -> Step;
-
-    /// Whether each ray meets this sphere or quadrangle as [`Meeting::cross_sphere`] and
-    /// [`Meeting::cross_quadrangle`] have it; else it is asked.
-    fn is_plain(&self, item: Item) -> bool;
-
-    /// The line of a ray crosses this sphere at two distances, the nearer one first, other than its
-    /// start if it leaves the sphere; infinite where there is none.
-    fn cross_sphere(&mut self, place: usize, item: Item, ends: [f64; 2]) -> Step;
-
-    /// The ray's line crosses a quadrangle that the ray does not leave, at a distance above 0.
-    fn cross_quadrangle(&mut self, place: usize, item: Item, t: f64) -> Step;
-
-    /// The ray may meet an item.
-    fn ask(&mut self, place: usize, item: Item, shear: &Shear, box_ray: &BoxRay) -> Step;
 }
 
 impl Default for Packet {

@@ -1,0 +1,24 @@
+//! What rays that are under way tell of what they meet.
+
+use super::{box_ray::BoxRay, ray::Shear, traversal::Step};
+use crate::prepared::record::Item;
+
+/// What is done with what rays meet. A ray is told by its place among those that are under way.
+pub(super) trait Meeting {
+    /// The ray at a place in the packet crosses a triangle at a distance, before or behind its start.
+    fn cross(&mut self, place: usize, item: Item, t: f64) -> Step;
+
+    /// Whether each ray meets this sphere or quadrangle as [`Meeting::cross_sphere`] and
+    /// [`Meeting::cross_quadrangle`] have it; else it is asked.
+    fn is_plain(&self, item: Item) -> bool;
+
+    /// The line of a ray crosses this sphere at two distances, the nearer one first, other than its
+    /// start if it leaves the sphere; infinite where there is none.
+    fn cross_sphere(&mut self, place: usize, item: Item, ends: [f64; 2]) -> Step;
+
+    /// The ray's line crosses a quadrangle that the ray does not leave, at a distance above 0.
+    fn cross_quadrangle(&mut self, place: usize, item: Item, t: f64) -> Step;
+
+    /// The ray may meet an item.
+    fn ask(&mut self, place: usize, item: Item, shear: &Shear, box_ray: &BoxRay) -> Step;
+}
