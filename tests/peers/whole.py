@@ -2,7 +2,8 @@
 """Time whole commands of rtfarm and of other renderers: meshes and spheres beside Mitsuba, solids beside
 POV-Ray with the same samples, and with as few as an error needs.
 
-    python3 whole.py RTFARM CONVERTERS [--runs 3] [--only meshes|equal|same|adaptive] [--quiet COMMAND]
+    python3 whole.py RTFARM CONVERTERS [--runs 3] [--only meshes|equal|same|adaptive]
+                     [--scene WORD] [--quiet COMMAND]
 
 RTFARM is the program, CONVERTERS the folder with rt.py, to_pov.py, to_mitsuba.py, mitsuba_run.py and
 gen_scenes.py. Prints tables of medians of runs that take turns; one whose renderer is missing is
@@ -11,8 +12,9 @@ before, rays of mirrors and glass alone), and rtfarm has its default workers bes
 the greatest sum of the proportional set sizes (PSS) of all processes of one further run. On solids both
 programs have two threads, no secondary light, rtfarm's depth and linear light. POV-Ray's 17 samples are one and then 4 x 4; its adaptive ones are `+AM2`. An error is the root
 of the mean square against the program's own converged picture, in steps of 8 bits: POV-Ray's has
-9 x 9 samples in each quarter of a pixel, rtfarm's 1024 a pixel. Each POV-Ray row has beside it the
-coarsest `--error` of a ladder by sqrt(2) that comes at least as near. COMMAND is put before each
+9 x 9 samples in each quarter of a pixel, rtfarm's 1024 a pixel; of meshes and spheres both have 256. Each POV-Ray row has beside it the
+coarsest `--error` of a ladder by sqrt(2) that comes at least as near. Of the meshes and spheres only those
+whose name has WORD are taken. COMMAND is put before each
 round of commands that are timed.
 """
 import argparse
@@ -166,6 +168,9 @@ class Bench:
         runs = [self.timed(commands) for _ in range(self.args.runs)]
         return [[statistics.median(times) for times in zip(*of)] for of in zip(*runs)]
 
+    def scenes(self):
+        return [(name, scene) for name, scene in MESHES if self.args.scene in name]
+
     def generated(self, scene):
         """The path of a scene of gen_scenes.py, told as its arguments."""
         # Not beside the links to the project's scenes, which are written through.
@@ -197,7 +202,7 @@ class Bench:
     def meshes(self):
         print('| 1280 x 720 | samples | Mitsuba: wall, processor s; MB | rtfarm | Mitsuba / rtfarm |'
               '\n|---|---|---|---|---|')
-        for name, scene in MESHES:
+        for name, scene in self.scenes():
             source = self.generated(scene)
             for samples in (1, 16):
                 peer = self.mitsuba(source, samples)
@@ -224,15 +229,15 @@ class Bench:
                     break
             return step, missed, found
 
-        for name, scene in MESHES:
+        for name, scene in self.scenes():
             source = self.generated(scene)
-            run(self.mitsuba(source, 1024, 'multijitter'))
+            run(self.mitsuba(source, 256, 'multijitter'))
             truth = read_png(path['mitsuba'])
-            squares = [1, 4, 9, 16, 25, 36, 64, 100, 144, 256, 400, 576]
+            squares = [1, 4, 9, 16, 25, 36, 64]
             found = [first_within('mitsuba', truth, squares, lambda n: self.mitsuba(source, n, 'multijitter'))]
-            run(self.whole(source, '--samples 1024'))
+            run(self.whole(source, '--samples 256'))
             truth = read_png(path['rtfarm'])
-            counts = [1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 128, 256]
+            counts = [1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64]
             found += [first_within('rtfarm', truth, counts, lambda n: self.whole(source, f'--samples {n}')),
                       first_within('rtfarm', truth, ERRORS, lambda level: self.whole(source, f'--error {level}'))]
             times = self.medians([command for _, _, command in found])
@@ -290,6 +295,7 @@ def main():
     args.add_argument('converters')
     args.add_argument('--runs', type=int, default=3)
     args.add_argument('--only', choices=['meshes', 'equal', 'same', 'adaptive'])
+    args.add_argument('--scene', default='', metavar='WORD')
     args.add_argument('--quiet', default='', metavar='COMMAND')
     args = args.parse_args()
     with tempfile.TemporaryDirectory() as folder:
