@@ -692,8 +692,8 @@ fn bad_input_gives_one_clear_line_and_an_exit_code() {
     let place = Place::new();
     fs::create_dir(place.path("folder.png")).unwrap();
     for (scene, output, rest, code, reason) in [
-        ("nowhere.rt", "o.png", "", 1, "cannot read the scene nowhere.rt: No such file"),
-        ("tmp", "o.png", "", 1, "cannot read the scene tmp: it is a folder"),
+        ("nowhere.rt", "o.png", "", 2, "cannot read the scene nowhere.rt: No such file"),
+        ("tmp", "o.png", "", 2, "cannot read the scene tmp: it is a folder"),
         ("scene.rt", "o.gif", "", 2, "must end in .png or .exr"),
         ("scene.rt", "png", "", 2, "must end in .png or .exr"),
         ("scene.rt", "o.exr", "--depth=16", 2, "--depth is for PNG"),
