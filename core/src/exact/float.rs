@@ -30,12 +30,43 @@ pub(crate) fn power_of_two_below_inverse(value: f64) -> f64 {
 #[inline(always)]
 pub(crate) fn below(value: f64) -> f32 {
     let rounded = value as f32;
-    if f64::from(rounded) > value { rounded.next_down() } else { rounded }
+    stepped(rounded, -i32::from(f64::from(rounded) > value))
 }
 
 /// Gives the smallest f32 that is not below `value`.
 #[inline(always)]
 pub(crate) fn above(value: f64) -> f32 {
     let rounded = value as f32;
-    if f64::from(rounded) < value { rounded.next_up() } else { rounded }
+    stepped(rounded, i32::from(f64::from(rounded) < value))
+}
+
+/// Goes up by a step between floating-point numbers, down by minus one or nowhere by none, without a
+/// branch, as nobody can guess how a number was rounded. A zero is left only to the side of its sign.
+#[inline(always)]
+fn stepped(number: f32, step: i32) -> f32 {
+    let bits = number.to_bits();
+    let sign = bits.cast_signed() >> 31 | 1;
+    f32::from_bits(bits.wrapping_add_signed(sign * step))
+}
+
+#[cfg(test)]
+mod tests {
+    use rtfarm_oracle::random::Random;
+
+    use super::*;
+
+    #[test]
+    fn numbers_are_rounded_to_the_nearest_on_their_side() {
+        let random = &mut Random::new(31);
+        let mut values = vec![0.0, -0.0, 1e300, -1e300, 1e-300, -1e-300, 1e-45, -1e-45, 1.0, -1.0];
+        values.extend((0..10_000).map(|_| {
+            let size = random.log_uniform(1e-46, 1e39);
+            size * random.between(-1.0, 1.0)
+        }));
+        for value in values {
+            let (low, high) = (below(value), above(value));
+            assert!(f64::from(low) <= value && value < f64::from(low.next_up()), "{value:e}");
+            assert!(f64::from(high) >= value && value > f64::from(high.next_down()), "{value:e}");
+        }
+    }
 }

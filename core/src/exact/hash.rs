@@ -158,8 +158,8 @@ mod tests {
         for count in [0, 1, 2, 20, 100_000] {
             // Every tenth is there twice, and every seventh is left out.
             let hash = |k: u32| {
-                let number = if k % 10 == 0 { k / 20 } else { k + count };
-                (k % 7 != 0).then(|| function.hash([number.into()]))
+                let number = if k.is_multiple_of(10) { k / 20 } else { k + count };
+                (!k.is_multiple_of(7)).then(|| function.hash([number.into()]))
             };
             let is_marked = |k: u32| k % 50 == 1;
             for threads in [1, 2, 5] {

@@ -6,6 +6,8 @@
 //! of Packets" (2008). The same input gives the same bytes on any number of threads: bins hold
 //! minima, maxima and counts, which do not care for order, and every split is made by one thread.
 
+use std::ops::Range;
+
 use glam::Vec4;
 use rayon::prelude::*;
 
@@ -21,6 +23,10 @@ const BINS: usize = 16;
 
 /// Ranges of up to this many items have half as many bins.
 const FEW: usize = 32;
+
+/// Two items are joined where the box around them has less than this part of what their own boxes have of
+/// surface: half of it where these are the same.
+const JOINED: f32 = 0.75;
 
 /// Which ranges are leaves.
 #[derive(Debug, Clone, Copy)]
@@ -65,8 +71,8 @@ impl Bounds {
     }
 }
 
-/// An item that the hierarchy is built over: its box and, in the bits of the fourth number of its
-/// least corner, its own number.
+/// What the hierarchy is built over: an item, or two that are joined. In the bits of the fourth numbers
+/// of its box are the number of the first one and how many they are.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct BuildPrimitive(Bounds);
 
@@ -77,26 +83,49 @@ impl BuildPrimitive {
         let [least_x, least_y, least_z] = [x + 0.0, y + 0.0, z + 0.0];
         let [x, y, z] = max.map(|x| x + 0.0);
         let min = Vec4::new(least_x, least_y, least_z, f32::from_bits(item));
-        Self(Bounds { min, max: Vec4::new(x, y, z, 0.0) })
+        Self(Bounds { min, max: Vec4::new(x, y, z, f32::from_bits(1)) })
     }
 
+    /// Joins an item and the next one, where the box around both is so small that no split between them
+    /// would be worth its while: so it is for the two halves of a quadrangle.
+    pub(super) fn joined(&self, next: &Self) -> Option<Self> {
+        let mut both = self.0.join(&next.0);
+        both.min.w = self.0.min.w;
+        both.max.w = f32::from_bits(2);
+        let apart = self.0.half_area() + next.0.half_area();
+        (both.half_area() < JOINED * apart).then_some(Self(both))
+    }
+
+    /// The number of the first item.
     pub(super) fn item(&self) -> u32 {
         self.0.min.w.to_bits()
+    }
+
+    /// How many items there are.
+    #[inline(always)]
+    fn count(&self) -> u32 {
+        self.0.max.w.to_bits()
+    }
+
+    /// The numbers of the items.
+    pub(super) fn items(&self) -> Range<u32> {
+        self.item()..self.item() + self.count()
     }
 }
 
 /// A run of primitives that will be a node or a leaf.
 struct BuildRange<'a> {
     primitives: &'a mut [BuildPrimitive],
-    /// The place of the first one in the whole order.
+    /// The place of the first item in the whole order, and how many there are.
     first: usize,
+    count: usize,
     bounds: Bounds,
     /// The bounds of twice the centres.
     centers: Bounds,
     leaves: Leaves,
 }
 
-/// Builds the hierarchy over `primitives` and brings them into the order in which leaves name them.
+/// Builds the hierarchy over `primitives` and brings them into the order in which leaves name their items.
 /// The root is node 0; every other node stands after its parent.
 pub(super) fn build_bvh(primitives: &mut [BuildPrimitive], leaves: Leaves) -> Vec<Node> {
     if primitives.is_empty() {
@@ -109,22 +138,22 @@ pub(super) fn build_bvh(primitives: &mut [BuildPrimitive], leaves: Leaves) -> Ve
 
 impl<'a> BuildRange<'a> {
     fn new(primitives: &'a mut [BuildPrimitive], first: usize, leaves: Leaves) -> Self {
+        let nothing = || (Bounds::NONE, Bounds::NONE, 0);
         let measure = |chunk: &[BuildPrimitive]| {
-            chunk.iter().fold((Bounds::NONE, Bounds::NONE), |(bounds, centers), primitive| {
-                let middle = primitive.0.twice_center();
-                let point = Bounds { min: middle, max: middle };
-                (bounds.join(&primitive.0), centers.join(&point))
+            chunk.iter().fold(nothing(), |(bounds, mut centers, count), primitive| {
+                centers.add(primitive.0.twice_center());
+                (bounds.join(&primitive.0), centers, count + primitive.count() as usize)
             })
         };
-        let (bounds, centers) = if primitives.len() > 8 * SERIAL {
+        let (bounds, centers, count) = if primitives.len() > 8 * SERIAL {
             primitives
                 .par_chunks(SERIAL)
                 .map(measure)
-                .reduce(|| (Bounds::NONE, Bounds::NONE), |a, b| (a.0.join(&b.0), a.1.join(&b.1)))
+                .reduce(nothing, |a, b| (a.0.join(&b.0), a.1.join(&b.1), a.2 + b.2))
         } else {
             measure(primitives)
         };
-        Self { primitives, first, bounds, centers, leaves }
+        Self { primitives, first, count, bounds, centers, leaves }
     }
 
     /// Splits in two where it is cheapest.
@@ -134,21 +163,30 @@ impl<'a> BuildRange<'a> {
             _ if self.primitives.len() <= FEW => self.cheapest_split::<{ BINS / 2 }>(),
             _ => self.cheapest_split::<BINS>(),
         };
-        let Self { primitives, first, leaves, .. } = self;
+        let Self { primitives, first, count, leaves, .. } = self;
         let Some(split) = split else {
             // Nothing tells them apart.
-            let at = primitives.len() / 2;
-            let (before, behind) = primitives.split_at_mut(at);
-            return [Self::new(before, first, leaves), Self::new(behind, first + at, leaves)];
+            let (before, behind) = primitives.split_at_mut(primitives.len() / 2);
+            let before = Self::new(before, first, leaves);
+            let at = first + before.count;
+            return [before, Self::new(behind, at, leaves)];
         };
         let (at, [left_centers, right_centers]) = split.partition(primitives);
         let [left, right] = split.sides;
         let (before, behind) = primitives.split_at_mut(at);
         [
-            Self { primitives: before, first, bounds: left, centers: left_centers, leaves },
+            Self {
+                primitives: before,
+                first,
+                count: split.left_count,
+                bounds: left,
+                centers: left_centers,
+                leaves,
+            },
             Self {
                 primitives: behind,
-                first: first + at,
+                first: first + split.left_count,
+                count: count - split.left_count,
                 bounds: right,
                 centers: right_centers,
                 leaves,
@@ -158,13 +196,13 @@ impl<'a> BuildRange<'a> {
 
     /// The leaf, where the range is one.
     fn as_leaf(&self) -> Option<Child> {
-        self.is_leaf().then(|| Child::leaf(self.first, self.primitives.len()))
+        self.is_leaf().then(|| Child::leaf(self.first, self.count))
     }
 
     fn is_leaf(&self) -> bool {
         let is_alone = |primitive: &BuildPrimitive| primitive.item() >= self.leaves.alone_from;
         self.primitives.len() == 1
-            || self.primitives.len() <= self.leaves.most && !self.primitives.iter().any(is_alone)
+            || self.count <= self.leaves.most && !self.primitives.iter().any(is_alone)
     }
 
     /// The split between two bins with the least area x count on its sides; `None` where the
@@ -201,7 +239,7 @@ impl<'a> BuildRange<'a> {
             for bin in 1..COUNT {
                 side = side.join(&bins[axis][bin - 1]);
                 let cost = side.bounds.half_area() * side.count as f32 + right_cost[bin];
-                let is_split = side.count > 0 && (side.count as usize) < self.primitives.len();
+                let is_split = side.count > 0 && (side.count as usize) < self.count;
                 if is_split && best.is_none_or(|best| cost < best.0) {
                     best = Some((cost, axis, bin));
                 }
@@ -211,7 +249,8 @@ impl<'a> BuildRange<'a> {
         let join =
             |bins: &[Bin]| bins.iter().fold(Bounds::NONE, |bounds, bin| bounds.join(&bin.bounds));
         let (left, right) = bins[axis].split_at(bin);
-        Some(Split { axis, bin, sides: [join(left), join(right)], binning })
+        let left_count = left.iter().map(|bin| bin.count as usize).sum();
+        Some(Split { axis, bin, left_count, sides: [join(left), join(right)], binning })
     }
 }
 
@@ -226,12 +265,15 @@ struct Binning {
 #[derive(Clone, Copy)]
 struct Bin {
     bounds: Bounds,
+    /// How many items.
     count: u32,
 }
 
 struct Split {
     axis: usize,
     bin: usize,
+    /// How many items are left of it.
+    left_count: usize,
     /// What is on each side.
     sides: [Bounds; 2],
     binning: Binning,
@@ -265,11 +307,11 @@ impl Binning {
 
     fn fill<const COUNT: usize>(&self, primitives: &[BuildPrimitive]) -> [[Bin; COUNT]; 3] {
         let mut bins = [[Bin::EMPTY; COUNT]; 3];
-        for BuildPrimitive(bounds) in primitives {
-            for (bins, bin) in bins.iter_mut().zip(self.bins(bounds)) {
+        for primitive in primitives {
+            for (bins, bin) in bins.iter_mut().zip(self.bins(&primitive.0)) {
                 let bin = &mut bins[bin % COUNT];
-                bin.bounds = bin.bounds.join(bounds);
-                bin.count += 1;
+                bin.bounds = bin.bounds.join(&primitive.0);
+                bin.count += primitive.count();
             }
         }
         bins
@@ -322,7 +364,7 @@ fn build_node(range: BuildRange<'_>, level: usize, nodes: &mut Vec<Node>) {
     }
     let own = nodes.len();
     nodes.push(node);
-    let total: usize = ranges.iter().map(|range| range.primitives.len()).sum();
+    let total: usize = ranges.iter().map(|range| range.count).sum();
     if total <= SERIAL {
         for (k, range) in ranges.into_iter().enumerate() {
             if let Some(leaf) = range.as_leaf() {
@@ -363,6 +405,7 @@ fn build_node(range: BuildRange<'_>, level: usize, nodes: &mut Vec<Node>) {
 
 #[cfg(test)]
 mod tests {
+    use glam::Vec3;
     use rtfarm_oracle::hard_case::HardCase;
 
     use super::*;
@@ -421,6 +464,46 @@ mod tests {
         for count in [1, 2, 7, 8, 9, 100, 50_000] {
             check(&scattered(count));
         }
+    }
+
+    #[test]
+    fn items_are_joined_that_fill_one_box() {
+        let item = |k: u32, min, max| BuildPrimitive::new(min, max, k);
+        let (low, high) = ([0.0; 3], [1.0, 1.0, 0.1]);
+        let half = item(6, low, high);
+        let both = half.joined(&item(7, [0.1, 0.0, 0.0], [1.0, 1.1, 0.1])).expect("nearly one box");
+        assert!(both.items().eq([6, 7]));
+        assert!(
+            both.0.min.truncate() == Vec3::ZERO
+                && both.0.max.truncate() == Vec3::new(1.0, 1.1, 0.1)
+        );
+        assert!(half.joined(&item(7, [1.0, 0.0, 0.0], [2.0, 1.0, 0.1])).is_none());
+        // Points have no surface, however far apart they are.
+        assert!(item(6, [0.0; 3], [0.0; 3]).joined(&item(7, [0.0; 3], [0.0; 3])).is_none());
+    }
+
+    #[test]
+    fn leaves_name_all_items_of_what_is_joined() {
+        let boxes = scattered(50_000);
+        let (mut primitives, mut next) = (Vec::new(), 0);
+        for (k, (min, max)) in boxes.into_iter().enumerate() {
+            let item = BuildPrimitive::new(min, max, next);
+            next += 1;
+            let both = || item.joined(&BuildPrimitive::new(min, max, next)).expect("one box");
+            primitives.push(if k % 3 == 0 { item } else { both() });
+            next += u32::from(k % 3 != 0);
+        }
+        let nodes = build_bvh(&mut primitives, LEAVES);
+        let order: Vec<u32> = primitives.iter().flat_map(BuildPrimitive::items).collect();
+        let mut is_seen = vec![false; order.len()];
+        for node in &nodes {
+            for child in node.children.into_iter().filter(|child| child.is_leaf()) {
+                for place in child.items() {
+                    assert!(!std::mem::replace(&mut is_seen[order[place] as usize], true));
+                }
+            }
+        }
+        assert!(is_seen.into_iter().all(|is_seen| is_seen));
     }
 
     #[test]

@@ -95,6 +95,17 @@ impl FlatFaces {
         Corners { points, count: corners.len() }
     }
 
+    /// The box around a face, as its least and its greatest corner.
+    #[inline]
+    pub(super) fn bounds(&self, face: usize) -> (DVec3, DVec3) {
+        let corners = &self.corners[self.corner_range(face)];
+        let first = self.points[corners[0] as usize];
+        corners[1..].iter().fold((first, first), |(min, max), &corner| {
+            let point = self.points[corner as usize];
+            (min.min(point), max.max(point))
+        })
+    }
+
     /// The corners of the faces of parallelepipeds in solids.
     pub(super) fn box_corners(&self) -> Vec<DVec3> {
         let corners = &self.corners[self.item_corner_count()..];

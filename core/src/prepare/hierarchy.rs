@@ -5,7 +5,6 @@ use rayon::prelude::*;
 
 use super::{
     bvh::{BuildPrimitive, Leaves, build_bvh},
-    flat::bounds_of,
     form::Form,
     surfaces::Surfaces,
 };
@@ -36,7 +35,7 @@ impl Hierarchy {
         let most = if form == Form::Compact { Child::MOST_ITEMS } else { FEW };
         let first_solid = surfaces.flat.item_count() + surfaces.spheres.len();
         let nodes = build_bvh(&mut primitives, Leaves { most, alone_from: first_solid as u32 });
-        let order = primitives.par_iter().map(BuildPrimitive::item).collect();
+        let order = primitives.par_iter().flat_map_iter(BuildPrimitive::items).collect();
         Self { frame, nodes, order }
     }
 }
@@ -73,6 +72,10 @@ fn round_bounds(surfaces: &Surfaces) -> impl Iterator<Item = (DVec3, DVec3)> {
     })
 }
 
+/// A thread joins items among so many.
+const JOINED_AT_ONCE: usize = 1 << 12;
+
+/// What the hierarchy is built over: flat faces, two at a time where they are as good as one, and all else.
 fn build_primitives(surfaces: &Surfaces, frame: &Frame) -> Vec<BuildPrimitive> {
     let flat = &surfaces.flat;
     let origin = DVec3::from_array(frame.origin);
@@ -85,10 +88,26 @@ fn build_primitives(surfaces: &Surfaces, frame: &Frame) -> Vec<BuildPrimitive> {
             item,
         )
     };
-    let round_count = surfaces.spheres.len() + surfaces.solids.len();
-    let mut primitives = Vec::with_capacity(flat.item_count() + round_count);
-    let of_face = |face: usize| primitive(bounds_of(&flat.corners_of(face)), face as u32);
-    primitives.par_extend((0..flat.item_count()).into_par_iter().map(of_face));
+    let of_face = |face: usize| primitive(flat.bounds(face), face as u32);
+    let of_run = |run: usize| {
+        let mut primitives: Vec<BuildPrimitive> = Vec::with_capacity(JOINED_AT_ONCE);
+        let mut is_open = false;
+        for face in JOINED_AT_ONCE * run..flat.item_count().min(JOINED_AT_ONCE * (run + 1)) {
+            let next = of_face(face);
+            let both = primitives.last().filter(|_| is_open).and_then(|last| last.joined(&next));
+            if let Some(both) = both {
+                primitives.pop();
+                primitives.push(both);
+            } else {
+                primitives.push(next);
+            }
+            is_open = both.is_none();
+        }
+        primitives
+    };
+    let runs = flat.item_count().div_ceil(JOINED_AT_ONCE);
+    let runs: Vec<Vec<BuildPrimitive>> = (0..runs).into_par_iter().map(of_run).collect();
+    let mut primitives = runs.concat();
     let round = round_bounds(surfaces).zip(flat.item_count() as u32..);
     primitives.extend(round.map(|(round, item)| primitive(round, item)));
     primitives

@@ -74,7 +74,7 @@ const LARGE: usize = 256;
 /// The faces that may overlap one of another primitive: of a large primitive only those in the box
 /// around all others.
 fn meeting_others(flat: &FlatFaces, ranks: &Ranks) -> Vec<u32> {
-    let bounds = |face: usize| bounds_of(&flat.corners_of(face));
+    let bounds = |face: usize| flat.bounds(face);
     let bounds_of_run =
         |run: &Range<usize>| run.clone().into_par_iter().map(bounds).reduce(|| NOTHING, joined);
     // Large primitives with their boxes, and the faces of all others.
