@@ -7,11 +7,11 @@ mod values;
 
 use std::{path::PathBuf, time::Duration};
 
-use clap::{Args as ClapArgs, Parser, Subcommand, value_parser};
+use clap::{Arg, Args as ClapArgs, CommandFactory, FromArgMatches, Parser, Subcommand};
 use rtfarm_core::render::StandardError;
 use rtfarm_ladder::Effort;
 
-use self::values::{parse_error, parse_seconds};
+use self::values::{parse_error, parse_seconds, whole_number};
 use crate::{
     frames::FrameRange,
     slurm::{Host, SbatchOptions},
@@ -183,7 +183,7 @@ pub(crate) struct VerifyArgs {
     pub(crate) tiles: TileShare,
 
     /// Threads; all cores by default.
-    #[arg(long, value_name = "N", value_parser = value_parser!(u16).range(1..=1024), help_heading = WORK)]
+    #[arg(long, value_name = "N", value_parser = whole_number::<u16>(1..=1024), help_heading = WORK)]
     threads: Option<u16>,
 
     /// The instruction set that the kernels use; all give the same bytes.
@@ -279,11 +279,11 @@ pub(crate) struct RenderArgs {
     slurm_host: Option<Host>,
 
     /// Worker processes; 0 renders in this one. Default: 2, or 1 on a single core.
-    #[arg(long, value_name = "N", value_parser = value_parser!(u16).range(0..=256), help_heading = WORK)]
+    #[arg(long, value_name = "N", value_parser = whole_number::<u16>(0..=256), help_heading = WORK)]
     workers: Option<u16>,
 
     /// Threads of each worker; by default the cores are shared out.
-    #[arg(long, value_name = "N", value_parser = value_parser!(u16).range(1..=1024), help_heading = WORK)]
+    #[arg(long, value_name = "N", value_parser = whole_number::<u16>(1..=1024), help_heading = WORK)]
     threads: Option<u16>,
 
     /// The instruction set that the kernels use; all give the same bytes.
@@ -315,6 +315,19 @@ pub(crate) struct RenderArgs {
     /// How log lines are written.
     #[arg(long, value_name = "FORMAT", default_value = "text", help_heading = TALK)]
     pub(crate) log_format: LogFormat,
+}
+
+impl Args {
+    /// Reads the command line. A number below zero is a value of its option there, so that what is said
+    /// of it is what would be right.
+    pub(crate) fn read() -> Result<Self, clap::Error> {
+        let takes_numbers = |argument: Arg| {
+            let takes = argument.get_action().takes_values();
+            argument.allow_negative_numbers(takes)
+        };
+        let command = Self::command().mut_subcommands(|command| command.mut_args(takes_numbers));
+        Self::from_arg_matches(&command.try_get_matches()?)
+    }
 }
 
 impl ReportArgs {
@@ -369,7 +382,6 @@ mod tests {
 
     #[test]
     fn the_words_fit_together() {
-        use clap::CommandFactory;
         Args::command().debug_assert();
     }
 }

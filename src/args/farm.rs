@@ -3,7 +3,7 @@
 use std::{fs, os::unix::fs::MetadataExt, path::PathBuf, time::Duration};
 
 use anyhow::{Context, ensure};
-use clap::{Args as ClapArgs, ValueEnum, value_parser};
+use clap::{Args as ClapArgs, ValueEnum};
 use rtfarm_coordinator::{Limits, OrderLimits, Owner, Role};
 use rtfarm_proto::{Access, Address};
 
@@ -11,6 +11,7 @@ use super::{
     FARM, LIMITS, TALK, WORK, core_count,
     values::{
         IsaChoice, LogFormat, parse_fraction, parse_gigabytes, parse_millions, parse_seconds,
+        whole_number,
     },
 };
 
@@ -99,7 +100,7 @@ pub(crate) struct CoordinatorArgs {
     greeting_seconds: Duration,
 
     /// The most connections on which nobody has shown a token yet.
-    #[arg(long, value_name = "N", default_value = "64", value_parser = value_parser!(u16).range(1..), env = "RTFARM_STRANGERS", help_heading = LIMITS)]
+    #[arg(long, value_name = "N", default_value = "64", value_parser = whole_number::<u16>(1..=u16::MAX), env = "RTFARM_STRANGERS", help_heading = LIMITS)]
     strangers: u16,
 
     /// Who sends nothing of a scene or takes nothing of one or of a picture for this long is given up.
@@ -112,7 +113,7 @@ pub(crate) struct CoordinatorArgs {
 
     /// The most bytes, in MB, of pixels, scenes and pictures that are in memory on their way here, and as
     /// many on their way elsewhere; what more there is waits.
-    #[arg(long, value_name = "MB", default_value = "1000", value_parser = value_parser!(u32).range(16..), env = "RTFARM_FLIGHT_MB", help_heading = LIMITS)]
+    #[arg(long, value_name = "MB", default_value = "1000", value_parser = whole_number::<u32>(16..=u32::MAX), env = "RTFARM_FLIGHT_MB", help_heading = LIMITS)]
     flight_mb: u32,
 
     /// The most jobs that have not ended, of each owner of a token and of all others together; who has the
@@ -133,11 +134,11 @@ pub(crate) struct CoordinatorArgs {
     pub(crate) lease_seconds: Duration,
 
     /// How long a job that has ended is kept if nobody fetches its picture.
-    #[arg(long, value_name = "HOURS", default_value = "168", value_parser = value_parser!(u32).range(1..=87_600), env = "RTFARM_KEEP_HOURS")]
+    #[arg(long, value_name = "HOURS", default_value = "168", value_parser = whole_number::<u32>(1..=87_600), env = "RTFARM_KEEP_HOURS")]
     pub(crate) keep_hours: u32,
 
     /// The most bytes, in GB, that jobs that have ended are kept in; the oldest go first.
-    #[arg(long, value_name = "GB", default_value = "16", value_parser = value_parser!(u32).range(1..), env = "RTFARM_KEEP_GB")]
+    #[arg(long, value_name = "GB", default_value = "16", value_parser = whole_number::<u32>(1..=u32::MAX), env = "RTFARM_KEEP_GB")]
     pub(crate) keep_gb: u32,
 
     /// How much of what a worker renders another renders again, to find out who lies, from 0 to 1;
@@ -156,7 +157,7 @@ pub(crate) struct WorkerArgs {
     pub(crate) coordinator: AccessArgs,
 
     /// Threads; all cores by default.
-    #[arg(long, value_name = "N", value_parser = value_parser!(u16).range(1..=1024), env = "RTFARM_THREADS", help_heading = WORK)]
+    #[arg(long, value_name = "N", value_parser = whole_number::<u16>(1..=1024), env = "RTFARM_THREADS", help_heading = WORK)]
     threads: Option<u16>,
 
     /// The instruction set that the kernels use; all give the same bytes.

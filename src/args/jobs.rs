@@ -2,14 +2,14 @@
 
 use std::{path::PathBuf, time::Duration};
 
-use clap::{Args as ClapArgs, builder::NonEmptyStringValueParser, value_parser};
+use clap::{Args as ClapArgs, builder::NonEmptyStringValueParser};
 use rtfarm_coordinator::Owner;
 
 use super::{
     FARM, TALK,
     farm::AccessArgs,
     picture::PictureArgs,
-    values::{LogFormat, number, parse_seconds},
+    values::{LogFormat, number, parse_seconds, whole_number},
 };
 
 #[derive(Debug, ClapArgs)]
@@ -38,11 +38,11 @@ pub(crate) struct SubmitArgs {
     pub(crate) key: Option<String>,
 
     /// Jobs of a higher priority come first.
-    #[arg(long, value_name = "N", default_value_t = 0, allow_negative_numbers = true, env = "RTFARM_PRIORITY", help_heading = FARM)]
+    #[arg(long, value_name = "N", default_value_t = 0, env = "RTFARM_PRIORITY", help_heading = FARM)]
     pub(crate) priority: i32,
 
     /// The most workers that render it at the same time.
-    #[arg(long, value_name = "N", value_parser = value_parser!(u32).range(1..), env = "RTFARM_MAX_WORKERS", help_heading = FARM)]
+    #[arg(long, value_name = "N", value_parser = whole_number::<u32>(1..=u32::MAX), env = "RTFARM_MAX_WORKERS", help_heading = FARM)]
     pub(crate) max_workers: Option<u32>,
 
     /// Answer in JSON.
@@ -109,7 +109,7 @@ pub(crate) struct PriorityArgs {
     pub(crate) job: JobArgs,
 
     /// 0 is that of a job of which nothing is said.
-    #[arg(value_name = "N", allow_negative_numbers = true, value_parser = number::<i32>("a whole number of at most nine digits"))]
+    #[arg(value_name = "N", value_parser = number::<i32>("a whole number of at most nine digits"))]
     pub(crate) priority: i32,
 }
 

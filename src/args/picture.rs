@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use clap::{Args as ClapArgs, ValueEnum, value_parser};
+use clap::{Args as ClapArgs, ValueEnum};
 use rtfarm_core::{
     prepare::Form,
     render::{Quality, SampleCount, SampleLimit, Sampling, StandardError},
@@ -16,6 +16,7 @@ use super::{
     PICTURE, SceneArgs, WORK,
     values::{
         parse_crop, parse_error, parse_max_samples, parse_samples, parse_size, parse_transfer,
+        whole_number,
     },
 };
 use crate::output::Output;
@@ -48,7 +49,7 @@ pub(crate) struct SettingArgs {
     max_samples: Option<SampleLimit>,
 
     /// Chooses the random numbers [default: 0].
-    #[arg(long, value_name = "N", help_heading = PICTURE)]
+    #[arg(long, value_name = "N", value_parser = whole_number(0..=u64::MAX), help_heading = PICTURE)]
     seed: Option<u64>,
 
     /// Show every surface in its plain colour, as in a scene without light.
@@ -60,7 +61,7 @@ pub(crate) struct SettingArgs {
     secondary: Option<Switch>,
 
     /// The side of a tile in pixels; by default the one that gives about 1000 tiles.
-    #[arg(long, value_name = "N", value_parser = value_parser!(u64).range(TileGrid::SIDES), help_heading = PICTURE)]
+    #[arg(long, value_name = "N", value_parser = whole_number(TileGrid::SIDES), help_heading = PICTURE)]
     tile: Option<u64>,
 
     /// What the numbers of colours say: the light itself, or light encoded by the sRGB curve [default: none].

@@ -72,6 +72,18 @@ pub(super) fn number<T: FromStr>(
     move |text| text.parse().map_err(|_| format!("it must be {wanted}"))
 }
 
+pub(super) fn whole_number<T>(
+    range: RangeInclusive<T>,
+) -> impl Fn(&str) -> Result<T, String> + Clone
+where
+    T: FromStr + PartialOrd + fmt::Display + Clone,
+{
+    move |text| {
+        let number = text.parse().ok().filter(|number| range.contains(number));
+        number.ok_or_else(|| out_of_range("it", &range))
+    }
+}
+
 pub(super) fn parse_size(text: &str) -> Result<Size, String> {
     let sides = text.split_once('x').and_then(|(w, h)| Some((w.parse().ok()?, h.parse().ok()?)));
     let (width, height) = sides.ok_or("a size looks like 1280x720")?;
@@ -96,7 +108,7 @@ pub(super) fn parse_max_samples(text: &str) -> Result<SampleLimit, String> {
     limit.ok_or_else(|| out_of_range("the most samples", &SampleLimit::RANGE))
 }
 
-pub(super) fn out_of_range(what: &str, range: &RangeInclusive<u32>) -> String {
+fn out_of_range<T: fmt::Display>(what: &str, range: &RangeInclusive<T>) -> String {
     format!("{what} must be a whole number from {} to {}", range.start(), range.end())
 }
 

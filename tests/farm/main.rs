@@ -728,7 +728,7 @@ fn bad_input_gives_one_clear_line_and_an_exit_code() {
         ("scene.rt", "o.png", "--size=1e3x5", 2, "a size looks like 1280x720"),
         ("scene.rt", "o.png", "--crop=1,2,3", 2, "a crop window looks like 320,180,640,360"),
         ("scene.rt", "o.png", "--crop=0,0,9999,1", 2, "does not have all of the crop window"),
-        ("scene.rt", "o.png", "--tile=2", 2, "2 is not in 4..=1024"),
+        ("scene.rt", "o.png", "--tile=2", 2, "must be a whole number from 4 to 1024"),
         ("scene.rt", "o.png", "--samples=0", 2, "must be a whole number from 1 to 65536"),
         ("scene.rt", "o.png", "--error=0", 2, "must be a number above 0 and at most 1"),
         ("scene.rt", "o.png", "--max-samples=7", 2, "must be a whole number from 8 to 65536"),
@@ -745,6 +745,17 @@ fn bad_input_gives_one_clear_line_and_an_exit_code() {
         2,
         "'rendr'; tip: some similar subcommands exist: 'report', 'retry', 'render'",
     );
+    for (option, reason) in [
+        ("--error", "must be a number above 0 and at most 1"),
+        ("--samples", "must be a whole number from 1 to 65536"),
+        ("--time", "a time is from 0.1 to 86400 seconds"),
+        ("--workers", "must be a whole number from 0 to 256"),
+        ("--seed", "must be a whole number from 0 to 18446744073709551615"),
+        ("--tile", "must be a whole number from 4 to 1024"),
+    ] {
+        let args = ["render", "scene.rt", "-o", "o.png", option, "-1"];
+        check_refused(&place, &args, 2, reason);
+    }
     check_refused(&place, &["render", "scene.rt"], 2, "--output <FILE>");
     let huge = ["render", "scene.rt", "-o", "o.png", "--size", "65535x65535", "--tile", "4"];
     check_refused(&place, &huge, 2, "at most 1048576 tiles");
