@@ -60,7 +60,7 @@ pub(crate) struct SettingArgs {
     #[arg(long, value_name = "on|off", hide_possible_values = true, help_heading = PICTURE)]
     secondary: Option<Switch>,
 
-    /// The side of a tile in pixels; by default the one that gives about 1000 tiles.
+    /// The side of a tile in pixels; by default the one that gives about 1000 tiles, or 150 at least.
     #[arg(long, value_name = "N", value_parser = whole_number(TileGrid::SIDES), help_heading = PICTURE)]
     tile: Option<u64>,
 
