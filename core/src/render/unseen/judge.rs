@@ -270,7 +270,8 @@ impl<'a> Judge<'a> {
         };
         suspects.retain(|&index| {
             let outline = &outlines.as_slice()[index];
-            let is_passed = contains(outlines.corners_of(outline), place)
+            let is_passed = !self.is_negligible(1.0, light)
+                && contains(outlines.corners_of(outline), place)
                 && cut(outline, &mut clipper).is_some()
                 && contains(clipper.polygon(), place);
             if is_passed {
@@ -278,6 +279,9 @@ impl<'a> Judge<'a> {
             }
             !is_passed
         });
+        if self.is_negligible(1.0, light) {
+            suspects.clear();
+        }
         for &index in &suspects {
             let outline = &outlines.as_slice()[index];
             let contrast = (1.0 - share_kept(outline)) * light;

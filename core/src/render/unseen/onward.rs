@@ -300,11 +300,11 @@ impl<'a> OnwardSearch<'a> {
         for look in looks {
             let (x, y, first) = (look.x, look.y, &look.first);
             let deepest = DEPTH_RATIO * first.hit.t / screen.direction(first.place).length();
-            let beam = Beam { block: Rectangle::of_pixel(x, y), deepest };
+            let reach = Reach::Behind(*sheet);
+            let beam = Beam { block: Rectangle::of_pixel(x, y), deepest, reach };
             if !tools.frustum_search.collect(self.view, screen, &beam, MOST_FACES) {
                 continue;
             }
-            let reach = Reach::Behind(*sheet);
             let sight = Sight { screen, beam: self.beam, reach, weight: look.weight, deepest };
             let outlines = &tools.frustum_search.outlines;
             let faces = outlines.by_rank();
