@@ -11,7 +11,7 @@ use super::{
     box_ray::BoxRay,
     boxes::{BoxKernel, KernelWork},
     boxes_x86::Avx2Boxes,
-    lanes::{Beam, Crossings, FACES, GROUPS, LANES, RayGroup, Turn},
+    lanes::{Beam, Crossings, FACES, Focus, GROUPS, LANES, RayGroup, Sieve, Turn},
     ray::{Ray, Shear},
 };
 use crate::prepared::{
@@ -78,18 +78,43 @@ impl BoxKernel for Avx512Boxes {
     }
 
     #[inline(always)]
+    fn shorten(self, group: &mut RayGroup, turn: &Turn) {
+        self.0.shorten(group, turn);
+    }
+
+    #[inline(always)]
     fn surround(self, groups: &[RayGroup], is_forward: [bool; 3]) -> Beam {
         self.0.surround(groups, is_forward)
     }
 
     #[inline(always)]
-    fn enter(self, groups: &[RayGroup; GROUPS], planes: [[f32; 3]; 2], mask: u64) -> u64 {
-        self.0.enter(groups, planes, mask)
+    fn enter<const ONE: bool>(
+        self,
+        groups: &[RayGroup; GROUPS],
+        planes: [[f32; 3]; 2],
+        mask: u64,
+    ) -> u64 {
+        self.0.enter::<ONE>(groups, planes, mask)
     }
 
     #[inline(always)]
     fn meet_beam(self, node: &Node, beam: &Beam) -> ([f32; 8], u32) {
         self.0.meet_beam(node, beam)
+    }
+
+    #[inline(always)]
+    fn spread(self, groups: &[RayGroup], point: &[f64; 3]) -> f64 {
+        self.0.spread(groups, point)
+    }
+
+    #[inline(always)]
+    fn sieve(self, corners: &[[f64; 3]; 3], focus: &Focus) -> Sieve {
+        self.0.sieve(corners, focus)
+    }
+
+    #[inline(always)]
+    fn sift(self, groups: &[RayGroup; GROUPS], sieve: &Sieve, mask: u64) -> u64 {
+        self.0.sift(groups, sieve, mask)
     }
 
     #[inline(always)]
@@ -126,15 +151,16 @@ impl BoxKernel for Avx512Boxes {
             // group is, and the store take arrays of exactly 8 numbers.
             let [possible, certain] = unsafe {
                 let load = |lanes: &[f64; LANES]| _mm512_load_pd(lanes.as_ptr());
-                let origin =
-                    [load(&group.origin[0]), load(&group.origin[1]), load(&group.origin[2])];
                 let slopes = [load(&group.slopes[0]), load(&group.slopes[1])];
                 let zero = _mm512_setzero_pd();
                 let [mut x, mut y, mut depth] = [[zero; 3]; 3];
                 for (corner, at) in corners.iter().enumerate() {
-                    depth[corner] = _mm512_sub_pd(_mm512_set1_pd(at[2]), origin[2]);
-                    let right = _mm512_sub_pd(_mm512_set1_pd(at[0]), origin[0]);
-                    let up = _mm512_sub_pd(_mm512_set1_pd(at[1]), origin[1]);
+                    let seen = |axis: usize| {
+                        let place = _mm512_set1_pd(at[axis]);
+                        _mm512_sub_pd(place, load(&group.origin[axis]))
+                    };
+                    let (right, up) = (seen(0), seen(1));
+                    depth[corner] = seen(2);
                     x[corner] = _mm512_sub_pd(right, _mm512_mul_pd(slopes[0], depth[corner]));
                     y[corner] = _mm512_sub_pd(up, _mm512_mul_pd(slopes[1], depth[corner]));
                 }

@@ -35,10 +35,14 @@ pub(super) struct RayGroup {
     /// In the order of the axes of the rays' [`Shear`].
     pub(super) origin: [[f64; LANES]; 3],
     pub(super) slopes: [[f64; LANES]; 3],
+    /// The first two, rounded.
+    pub(super) rounded_slopes: [[f32; LANES]; 2],
     /// In the order x, y, z.
     pub(super) direction: [[f64; LANES]; 3],
     /// The surface that a ray leaves in the lower half, what it went through in the upper half.
     pub(super) leaving: [u64; LANES],
+    /// Only what is met nearer than this counts.
+    pub(super) reach: [f64; LANES],
     pub(super) near_origin: [[f32; LANES]; 3],
     pub(super) far_origin: [[f32; LANES]; 3],
     pub(super) inverse: [[f32; LANES]; 3],
@@ -50,8 +54,10 @@ impl RayGroup {
     pub(super) const EMPTY: Self = Self {
         origin: [[0.0; LANES]; 3],
         slopes: [[0.0; LANES]; 3],
+        rounded_slopes: [[0.0; LANES]; 2],
         direction: [[0.0; LANES]; 3],
         leaving: [0; LANES],
+        reach: [0.0; LANES],
         near_origin: [[0.0; LANES]; 3],
         far_origin: [[0.0; LANES]; 3],
         inverse: [[0.0; LANES]; 3],
@@ -129,6 +135,47 @@ impl Beam {
     }
 }
 
+/// A point that the lines of all rays of a packet pass, near enough to tell from it which of them certainly
+/// pass by a triangle: where camera rays start, or where shadow rays end.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Focus {
+    /// In the order of the axes of the rays' [`Shear`].
+    pub(super) point: [f64; 3],
+    /// How far lines pass by it, at its depth, along the first or the second axis.
+    pub(super) spread: f64,
+    /// What f64 rounding may take from twice an area.
+    pub(super) blur: f64,
+}
+
+impl Focus {
+    /// A point for rays near the frame, with the axes of their [`Shear`]; `spread` is as
+    /// `BoxKernel::spread` finds it.
+    pub(super) fn new(point: [f64; 3], spread: f64, frame: &Frame, axes: [usize; 3]) -> Self {
+        let mut most = (NEAR_FRAME + 2.0) / frame.scale;
+        for (at, axis) in point.into_iter().zip(axes) {
+            most += (at - frame.origin[axis]).abs();
+        }
+        Self { point, spread, blur: most * most * BLUR }
+    }
+}
+
+/// See `docs/proof.md`, boxes.
+const BLUR: f64 = 1.0 / (1_u64 << 44) as f64;
+
+/// What decides in f32 whether rays certainly pass by a triangle: twice the areas of (ray, a, b), (ray, b, c)
+/// and (ray, c, a) as a ray through the focus sees them are linear in its slopes.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Sieve {
+    /// The factors of the first slope, of the second one and of 1, for each edge; the last edge is the
+    /// first once more.
+    pub(super) factors: [[f32; 4]; 3],
+    /// An area that is further than this from 0 has the sign that `edge` finds.
+    pub(super) bound: f32,
+}
+
+/// What f32 rounding takes from twice an area, as a part of its factors: see `docs/proof.md`, boxes.
+pub(super) const SIEVED: f64 = 8.0 / (1_u64 << 24) as f64;
+
 /// What rays are to a triangle, a bit each.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub(super) struct Crossings {
@@ -201,8 +248,32 @@ pub(super) fn fill(group: &mut RayGroup, rays: [&Ray; LANES], turn: &Turn) {
         group.slopes[0][lane] = x / z;
         group.slopes[1][lane] = y / z;
         group.slopes[2][lane] = 1.0 / z;
+        for (rounded, slope) in group.rounded_slopes.iter_mut().zip([x / z, y / z]) {
+            rounded[lane] = slope as f32;
+        }
+        group.reach[lane] = ray.reach;
         group.high[lane] = turn.reach.reach(ray.reach);
     }
+}
+
+/// `BoxKernel::shorten` in plain Rust.
+#[inline(always)]
+pub(super) fn shorten(group: &mut RayGroup, turn: &Turn) {
+    for (high, &reach) in group.high.iter_mut().zip(&group.reach) {
+        *high = smaller(turn.reach.reach(reach), *high);
+    }
+}
+
+/// The lanes in which a ray crosses a triangle of this rank in front of its start and within its reach,
+/// if it crosses it at these distances; not where it leaves the triangle.
+#[inline(always)]
+pub(super) fn within_reach(group: &RayGroup, rank: u32, distances: &[f64; LANES]) -> u64 {
+    let mut within = 0;
+    for (lane, &t) in distances.iter().enumerate() {
+        let is_ahead = (t > 0.0) & (group.leaving[lane] as u32 != rank);
+        within |= u64::from(is_ahead & (t <= group.reach[lane])) << lane;
+    }
+    within
 }
 
 /// Which end of an interval is wanted: the least or the greatest number.
@@ -241,21 +312,91 @@ pub(super) fn surround(groups: &[RayGroup], is_forward: [bool; 3]) -> Beam {
 
 /// `BoxKernel::enter` in plain Rust.
 #[inline(always)]
-pub(super) fn enter(groups: &[RayGroup; GROUPS], [near, far]: [[f32; 3]; 2], mask: u64) -> u64 {
+pub(super) fn enter<const ONE: bool>(
+    groups: &[RayGroup; GROUPS],
+    [near, far]: [[f32; 3]; 2],
+    mask: u64,
+) -> u64 {
     by_groups(mask, |group| {
         let group = &groups[group];
         let mut met = 0;
         for lane in 0..LANES {
             let (mut enter, mut leave) = (-0.0, group.high[lane]);
             for axis in 0..3 {
-                let to_near = near[axis] - group.near_origin[axis][lane];
-                let to_far = far[axis] - group.far_origin[axis][lane];
+                let (mut to_near, mut to_far) = (near[axis], far[axis]);
+                if !ONE {
+                    to_near -= group.near_origin[axis][lane];
+                    to_far -= group.far_origin[axis][lane];
+                }
                 enter = larger(to_near * group.inverse[axis][lane], enter);
                 leave = smaller(to_far * group.far_inverse[axis][lane], leave);
             }
             met |= u64::from(enter <= leave) << lane;
         }
         met
+    })
+}
+
+/// `BoxKernel::spread` in plain Rust.
+#[inline(always)]
+pub(super) fn spread(groups: &[RayGroup], point: &[f64; 3]) -> f64 {
+    let mut spread: f64 = 0.0;
+    for group in groups {
+        for lane in 0..LANES {
+            let seen = shear_at(group, lane, [0, 1, 2]).project(point);
+            spread = spread.max(seen.x.abs()).max(seen.y.abs());
+        }
+    }
+    spread
+}
+
+/// `BoxKernel::sieve` in plain Rust.
+#[inline(always)]
+pub(super) fn sieve(corners: &[[f64; 3]; 3], focus: &Focus) -> Sieve {
+    let mut seen = [[0.0; 3]; 3];
+    for (seen, corner) in seen.iter_mut().zip(corners) {
+        for axis in 0..3 {
+            seen[axis] = corner[axis] - focus.point[axis];
+        }
+    }
+    let mut sieve = Sieve { factors: [[0.0; 4]; 3], bound: 0.0 };
+    let mut bound: f64 = 0.0;
+    for edge in 0..4 {
+        let ([ax, ay, az], [bx, by, bz]) = (seen[edge % 3], seen[(edge + 1) % 3]);
+        let factors = [ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx];
+        for (factors, factor) in sieve.factors.iter_mut().zip(factors) {
+            factors[edge] = factor as f32;
+        }
+        let [x, y, z] = sieve.factors.map(|factors| factors[edge].abs());
+        let length = (bx - ax).abs() + (by - ay).abs() + (bz - az).abs();
+        bound = bound.max(f64::from(x + y + z) * SIEVED + length * (2.0 * focus.spread));
+    }
+    sieve.bound = bounded(bound, focus);
+    sieve
+}
+
+/// The bound of a [`Sieve`] from what its edges have.
+#[inline(always)]
+pub(super) fn bounded(of_edges: f64, focus: &Focus) -> f32 {
+    ((of_edges + focus.blur) * 1.001) as f32 + f32::MIN_POSITIVE
+}
+
+/// `BoxKernel::sift` in plain Rust.
+#[inline(always)]
+pub(super) fn sift(groups: &[RayGroup; GROUPS], sieve: &Sieve, mask: u64) -> u64 {
+    let Sieve { factors: [first, second, last], bound } = sieve;
+    by_groups(mask, |k| {
+        let [right, up] = &groups[k].rounded_slopes;
+        let mut possible = 0;
+        for lane in 0..LANES {
+            let area =
+                |edge: usize| (last[edge] + right[lane] * first[edge]) + up[lane] * second[edge];
+            let areas = [area(0), area(1), area(2)];
+            let is_past =
+                areas.iter().any(|area| *area < -bound) && areas.iter().any(|area| area > bound);
+            possible |= u64::from(!is_past) << lane;
+        }
+        possible
     })
 }
 
