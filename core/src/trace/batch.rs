@@ -10,7 +10,7 @@ use super::{
     boxes::{BoxKernel, KernelWork},
     hit::{Nearest, between, is_between, take, take_crossing, take_quadrangle, take_sphere},
     kernels::run_with_kernel,
-    lanes::{CLASSES, LANES, MOST_RAYS, RayGroup, within_reach},
+    lanes::{CLASSES, LANES, MOST_RAYS, RayGroup},
     lone::{Flights, visit_alone},
     meeting::Meeting,
     packet::{Packet, PacketStack, places, visit_packet},
@@ -233,7 +233,7 @@ impl<K: BoxKernel> Meeting for NearestOfPacket<'_, K> {
     fn cross_group(
         &mut self,
         (group, first): (&mut RayGroup, usize),
-        crossing: u64,
+        [crossing, within]: [u64; 2],
         item: Item,
         distances: &[f64; LANES],
     ) -> u64 {
@@ -248,10 +248,11 @@ impl<K: BoxKernel> Meeting for NearestOfPacket<'_, K> {
             return counts;
         }
         let rank = self.view.faces[item.index()].rank();
-        for lane in places(crossing & within_reach(group, rank, distances)) {
+        for lane in places(within) {
             let t = distances[lane % LANES];
             let hit = &mut self.hits[usize::from(self.members[first + lane])];
-            if take(hit, item, (t, rank, Part::WHOLE)) {
+            let leaves = group.leaving[lane % LANES] as u32 == rank;
+            if !leaves && take(hit, item, (t, rank, Part::WHOLE)) {
                 group.reach[lane % LANES] = t;
                 counts |= 1 << lane;
             }
@@ -393,7 +394,7 @@ impl<K: BoxKernel> Meeting for BlockedOfPacket<'_, K> {
     fn cross_group(
         &mut self,
         (group, first): (&mut RayGroup, usize),
-        crossing: u64,
+        [crossing, within]: [u64; 2],
         item: Item,
         distances: &[f64; LANES],
     ) -> u64 {
@@ -406,8 +407,9 @@ impl<K: BoxKernel> Meeting for BlockedOfPacket<'_, K> {
             return counts;
         }
         let rank = self.view.faces[item.index()].rank();
-        for lane in places(crossing & within_reach(group, rank, distances)) {
-            if distances[lane % LANES] < group.reach[lane % LANES] {
+        for lane in places(within) {
+            let leaves = group.leaving[lane % LANES] as u32 == rank;
+            if !leaves && distances[lane % LANES] < group.reach[lane % LANES] {
                 self.shades.shares[usize::from(self.members[first + lane])] = 0.0;
                 counts |= 1 << lane;
             }

@@ -70,11 +70,11 @@ pub(super) trait BoxKernel: Copy {
         lanes::enter::<ONE>(groups, planes, mask)
     }
 
-    /// The boxes of a node that some ray may meet, a bit each, and where the first one may enter
-    /// them. Rounding keeps order: what a ray computes lies between what the ends of the intervals
-    /// give.
+    /// Where the first ray may enter the boxes of a node, those that some ray may meet, a bit each, and those
+    /// that as good as all meet. Rounding keeps order: what a ray computes lies between what the ends of
+    /// the intervals give.
     #[inline(always)]
-    fn meet_beam(self, node: &Node, beam: &Beam) -> ([f32; 8], u32) {
+    fn meet_beam(self, node: &Node, beam: &Beam) -> ([f32; 8], u32, u32) {
         lanes::meet_beam(node, beam)
     }
 

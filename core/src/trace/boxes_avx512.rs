@@ -2,9 +2,9 @@
 //! of f32.
 
 use std::arch::x86_64::{
-    _CMP_GT_OQ, _CMP_LT_OQ, _mm512_abs_pd, _mm512_add_pd, _mm512_cmp_pd_mask, _mm512_div_pd,
-    _mm512_load_pd, _mm512_max_pd, _mm512_min_pd, _mm512_mul_pd, _mm512_set1_pd, _mm512_setzero_pd,
-    _mm512_storeu_pd, _mm512_sub_pd,
+    _CMP_GT_OQ, _CMP_LE_OQ, _CMP_LT_OQ, _mm512_abs_pd, _mm512_add_pd, _mm512_cmp_pd_mask,
+    _mm512_div_pd, _mm512_load_pd, _mm512_max_pd, _mm512_min_pd, _mm512_mul_pd, _mm512_set1_pd,
+    _mm512_setzero_pd, _mm512_storeu_pd, _mm512_sub_pd,
 };
 
 use super::{
@@ -98,7 +98,7 @@ impl BoxKernel for Avx512Boxes {
     }
 
     #[inline(always)]
-    fn meet_beam(self, node: &Node, beam: &Beam) -> ([f32; 8], u32) {
+    fn meet_beam(self, node: &Node, beam: &Beam) -> ([f32; 8], u32, u32) {
         self.0.meet_beam(node, beam)
     }
 
@@ -149,7 +149,7 @@ impl BoxKernel for Avx512Boxes {
             let group = &groups[k];
             // SAFETY: a value of this type says that the CPU has AVX-512. The loads, aligned as the
             // group is, and the store take arrays of exactly 8 numbers.
-            let [possible, certain] = unsafe {
+            let [possible, certain, within] = unsafe {
                 let load = |lanes: &[f64; LANES]| _mm512_load_pd(lanes.as_ptr());
                 let slopes = [load(&group.slopes[0]), load(&group.slopes[1])];
                 let zero = _mm512_setzero_pd();
@@ -192,8 +192,12 @@ impl BoxKernel for Avx512Boxes {
                 let t = _mm512_max_pd(_mm512_div_pd(sum, area), nearest);
                 let t = _mm512_min_pd(t, farthest);
                 _mm512_storeu_pd(distances[k].as_mut_ptr(), t);
-                [possible, u64::from(is_plain & is_one_sided) & possible]
+                let certain = u64::from(is_plain & is_one_sided) & possible;
+                let is_ahead = _mm512_cmp_pd_mask::<_CMP_GT_OQ>(t, zero);
+                let is_near = _mm512_cmp_pd_mask::<_CMP_LE_OQ>(t, load(&group.reach));
+                [possible, certain, u64::from(is_ahead & is_near) & certain]
             };
+            crossings.within |= within << (LANES * k);
             crossings.possible |= possible << (LANES * k);
             crossings.certain |= certain << (LANES * k);
         }

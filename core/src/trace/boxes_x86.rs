@@ -346,13 +346,14 @@ impl BoxKernel for Avx2Boxes {
     }
 
     #[inline(always)]
-    fn meet_beam(self, node: &Node, beam: &Beam) -> ([f32; 8], u32) {
+    fn meet_beam(self, node: &Node, beam: &Beam) -> ([f32; 8], u32, u32) {
         let mut distances = [0.0; 8];
         // SAFETY: a value of this type says that the CPU has AVX2. The loads read `planes[_]` and
         // the store writes `distances`, exactly 8 floats each.
-        let mask = unsafe {
+        let [mask, within] = unsafe {
             let mut enter = _mm256_set1_ps(-0.0);
             let mut leave = _mm256_set1_ps(beam.high);
+            let (mut all_enter, mut first_leaves) = (enter, leave);
             for axis in 0..3 {
                 let near = _mm256_loadu_ps(node.planes[beam.near[axis]].as_ptr());
                 let far = _mm256_loadu_ps(node.planes[beam.far[axis]].as_ptr());
@@ -362,15 +363,18 @@ impl BoxKernel for Avx2Boxes {
                 let a = _mm256_mul_ps(near, _mm256_set1_ps(a));
                 let b = _mm256_mul_ps(near, _mm256_set1_ps(b));
                 enter = _mm256_max_ps(_mm256_min_ps(a, b), enter);
+                all_enter = _mm256_max_ps(_mm256_max_ps(a, b), all_enter);
                 let [a, b] = beam.far_inverse[axis];
                 let a = _mm256_mul_ps(far, _mm256_set1_ps(a));
                 let b = _mm256_mul_ps(far, _mm256_set1_ps(b));
                 leave = _mm256_min_ps(_mm256_max_ps(a, b), leave);
+                first_leaves = _mm256_min_ps(_mm256_min_ps(a, b), first_leaves);
             }
             _mm256_storeu_ps(distances.as_mut_ptr(), enter);
-            _mm256_movemask_ps(_mm256_cmp_ps::<_CMP_LE_OQ>(enter, leave)) as u32
+            let not_after = |a, b| _mm256_movemask_ps(_mm256_cmp_ps::<_CMP_LE_OQ>(a, b)) as u32;
+            [not_after(enter, leave), not_after(all_enter, first_leaves)]
         };
-        (distances, mask)
+        (distances, mask, within)
     }
 
     #[inline(always)]
@@ -391,7 +395,7 @@ impl BoxKernel for Avx2Boxes {
             let (group, first) = (&groups[half / 2], 4 * (half % 2));
             // SAFETY: a value of this type says that the CPU has AVX2. The loads and the store
             // take 4 of 8 numbers, from the first or from the fifth on.
-            let [possible, certain] = unsafe {
+            let [possible, certain, within] = unsafe {
                 let load = |lanes: &[f64; LANES]| _mm256_load_pd(lanes.as_ptr().add(first));
                 let slopes = [&group.slopes[0], &group.slopes[1], &group.slopes[2]];
                 let zero = _mm256_setzero_pd();
@@ -407,8 +411,17 @@ impl BoxKernel for Avx2Boxes {
                     z[corner] = _mm256_mul_pd(load(slopes[2]), depth);
                 }
                 let four = &mut distances.as_flattened_mut().as_chunks_mut().0[half];
-                self.cross_seen([x, y, z], asking, four)
+                let [possible, certain] = self.cross_seen([x, y, z], asking, four);
+                let mut within = certain;
+                if certain != 0 {
+                    let t = _mm256_loadu_pd(four.as_ptr());
+                    let is_ahead = _mm256_cmp_pd::<_CMP_GT_OQ>(t, zero);
+                    let is_near = _mm256_cmp_pd::<_CMP_LE_OQ>(t, load(&group.reach));
+                    within &= _mm256_movemask_pd(_mm256_and_pd(is_ahead, is_near)) as u64;
+                }
+                [possible, certain, within]
             };
+            crossings.within |= within << (4 * half);
             crossings.possible |= possible << (4 * half);
             crossings.certain |= certain << (4 * half);
         }
@@ -550,7 +563,7 @@ impl BoxKernel for Avx2Boxes {
             }
             self.cross_seen([x, y, z], 0xF, distances)
         };
-        Crossings { possible, certain }
+        Crossings { possible, certain, within: 0 }
     }
 
     #[inline(always)]

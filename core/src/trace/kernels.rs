@@ -217,6 +217,7 @@ mod tests {
     struct FoundByGroup {
         entering: [u64; 8],
         met: u32,
+        within: u32,
         nears: [u32; 8],
         crossings: Crossings,
         distances: Vec<Option<u64>>,
@@ -237,7 +238,7 @@ mod tests {
                 assert_eq!(packet.enter(kernel, node, child, *mask), *entering);
             }
             let count = group.rays.len().div_ceil(LANES);
-            let (nears, met) = kernel.meet_beam(node, &packet.beam);
+            let (nears, met, within) = kernel.meet_beam(node, &packet.beam);
             let mut distances = packet.crossings;
             let crossings = kernel.cross(&packet.groups, corners, *mask, &mut distances);
             let distances = (distances.as_flattened().iter().enumerate())
@@ -268,6 +269,7 @@ mod tests {
             *self = Some(FoundByGroup {
                 entering,
                 met,
+                within,
                 nears,
                 crossings,
                 distances,
@@ -318,6 +320,9 @@ mod tests {
                 let is = |mask: u64| mask >> k & 1 == 1;
                 if is(found.crossings.certain) {
                     assert_eq!(found.distances[k], t, "{ray:?}");
+                    let is_within =
+                        t.map(f64::from_bits).is_some_and(|t| t > 0.0 && t <= ray.reach);
+                    assert_eq!(is(found.crossings.within), is_within, "{ray:?}");
                 }
                 assert!(is(found.crossings.possible) || t.is_none(), "{ray:?}");
                 if let Some((_, _, sifted)) = found.sifted {

@@ -183,6 +183,9 @@ pub(super) struct Crossings {
     pub(super) possible: u64,
     /// They cross it for certain, and their distances are known.
     pub(super) certain: u64,
+    /// They do so in front of their starts and within their reach. Of one ray before several triangles
+    /// this is not asked.
+    pub(super) within: u64,
 }
 
 /// The smaller number as the SIMD instructions have it: of a NaN and a number, the second operand.
@@ -262,18 +265,6 @@ pub(super) fn shorten(group: &mut RayGroup, turn: &Turn) {
     for (high, &reach) in group.high.iter_mut().zip(&group.reach) {
         *high = smaller(turn.reach.reach(reach), *high);
     }
-}
-
-/// The lanes in which a ray crosses a triangle of this rank in front of its start and within its reach,
-/// if it crosses it at these distances; not where it leaves the triangle.
-#[inline(always)]
-pub(super) fn within_reach(group: &RayGroup, rank: u32, distances: &[f64; LANES]) -> u64 {
-    let mut within = 0;
-    for (lane, &t) in distances.iter().enumerate() {
-        let is_ahead = (t > 0.0) & (group.leaving[lane] as u32 != rank);
-        within |= u64::from(is_ahead & (t <= group.reach[lane])) << lane;
-    }
-    within
 }
 
 /// Which end of an interval is wanted: the least or the greatest number.
@@ -402,22 +393,26 @@ pub(super) fn sift(groups: &[RayGroup; GROUPS], sieve: &Sieve, mask: u64) -> u64
 
 /// `BoxKernel::meet_beam` in plain Rust.
 #[inline(always)]
-pub(super) fn meet_beam(node: &Node, beam: &Beam) -> ([f32; 8], u32) {
+pub(super) fn meet_beam(node: &Node, beam: &Beam) -> ([f32; 8], u32, u32) {
     let mut distances = [-0.0; 8];
-    let mut mask = 0;
+    let (mut mask, mut within) = (0, 0);
     for (child, enter) in distances.iter_mut().enumerate() {
         let mut leave = beam.high;
+        let (mut all_enter, mut first_leaves) = (-0.0, leave);
         for axis in 0..3 {
             let near = node.planes[beam.near[axis]][child] - beam.near_origin[axis];
             let far = node.planes[beam.far[axis]][child] - beam.far_origin[axis];
             let [a, b] = beam.inverse[axis];
             *enter = larger(smaller(near * a, near * b), *enter);
+            all_enter = larger(larger(near * a, near * b), all_enter);
             let [a, b] = beam.far_inverse[axis];
             leave = smaller(larger(far * a, far * b), leave);
+            first_leaves = smaller(smaller(far * a, far * b), first_leaves);
         }
         mask |= u32::from(*enter <= leave) << child;
+        within |= u32::from(all_enter <= first_leaves) << child;
     }
-    (distances, mask)
+    (distances, mask, within)
 }
 
 /// `BoxKernel::cross` in plain Rust.
@@ -428,7 +423,7 @@ pub(super) fn cross(
     mask: u64,
     distances: &mut [[f64; LANES]; GROUPS],
 ) -> Crossings {
-    let mut certain = 0;
+    let (mut certain, mut within) = (0, 0);
     let possible = by_groups(mask, |k| {
         let group = &groups[k];
         let mut possible = 0;
@@ -437,10 +432,12 @@ pub(super) fn cross(
             let crossing = cross_seen(&shear.project_all(corners), distance);
             possible |= crossing.possible << lane;
             certain |= crossing.certain << (LANES * k + lane);
+            let is_within = *distance > 0.0 && *distance <= group.reach[lane];
+            within |= (crossing.certain & u64::from(is_within)) << (LANES * k + lane);
         }
         possible
     });
-    Crossings { possible, certain: certain & mask }
+    Crossings { possible, certain: certain & mask, within: within & mask }
 }
 
 /// `BoxKernel::cross_four` in plain Rust.
@@ -471,12 +468,12 @@ fn cross_seen([a, b, c]: &[Projected; 3], distance: &mut f64) -> Crossings {
     let extent = [a, b, c].iter().map(|p| p.x.abs().max(p.y.abs())).fold(0.0, f64::max);
     let area = over[0] + over[1] + over[2];
     if over.contains(&0.0) || area.abs() <= extent * extent / 8.0 {
-        return Crossings { possible: 1, certain: 0 };
+        return Crossings { possible: 1, ..Crossings::default() };
     }
     let t = (over[0] * a.z + over[1] * b.z + over[2] * c.z) / area;
     let (least, most) = (a.z.min(b.z).min(c.z), a.z.max(b.z).max(c.z));
     *distance = t.max(least).min(most);
-    Crossings { possible: 1, certain: 1 }
+    Crossings { possible: 1, certain: 1, within: 0 }
 }
 
 /// What a lane holds, as a [`Shear`] with these axes.

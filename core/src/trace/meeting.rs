@@ -17,12 +17,13 @@ pub(super) trait Meeting {
     /// The ray at a place in the packet crosses a triangle at a distance, before or behind its start.
     fn cross(&mut self, place: usize, item: Item, t: f64) -> Step;
 
-    /// The same for rays of a group whose first one is at a place, by a mask of its lanes; which of them have
-    /// met something that counts. Where rays reach less far then, the group knows.
+    /// The same for rays of a group whose first one is at a place, by a mask of its lanes, and by one of those
+    /// among them that do so in front of their starts and within their reach; which of them have met something
+    /// that counts. Where rays reach less far then, the group knows.
     fn cross_group(
         &mut self,
         group: (&mut RayGroup, usize),
-        crossing: u64,
+        crossing: [u64; 2],
         item: Item,
         distances: &[f64; LANES],
     ) -> u64;

@@ -237,6 +237,7 @@ impl Packet {
             let met = kernel.cross(&self.groups, &corners, mask, &mut self.crossings);
             for (k, crossing) in groups(met.certain) {
                 let group = (&mut self.groups[k], LANES * k);
+                let crossing = [crossing, met.within >> (LANES * k) & 0xFF];
                 let counts = meeting.cross_group(group, crossing, item, &self.crossings[k]);
                 if counts != 0 && M::ENDS {
                     self.alive &= !(counts << (LANES * k));
@@ -439,12 +440,22 @@ pub(super) fn visit_packet(
             packet.shorten_beam();
         } else {
             let node = view.node(current.node(), room);
-            let (nears, mut met) = kernel.meet_beam(node, &packet.beam);
+            let (nears, mut met, within) = kernel.meet_beam(node, &packet.beam);
+            if met.is_power_of_two() {
+                // Boxes further down tell which rays enter them.
+                let child = node.children[met.trailing_zeros() as usize & 7];
+                if !child.is_leaf() {
+                    current = child;
+                    continue;
+                }
+            }
             let first = waiting;
             while met != 0 {
                 let child = met.trailing_zeros() as usize & 7;
                 met &= met - 1;
-                let entering = packet.enter(kernel, node, child, mask);
+                let is_within = within >> child & 1 == 1;
+                let entering =
+                    if is_within { mask } else { packet.enter(kernel, node, child, mask) };
                 if entering == 0 {
                     continue;
                 }

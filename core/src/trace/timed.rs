@@ -38,22 +38,23 @@ impl<'a> TimedKernels<'a> {
     /// ray is its start, its direction of length 1, its reach and a number that counts nothing; in
     /// the scene's units.
     pub fn meet(&mut self, rays: &[[f32; 8]], distances: &mut Vec<f64>) {
+        // A power of two, whose inverse is exact.
+        let from_units = 1.0 / self.view.header.scale;
+        distances.reserve(rays.len());
         for rays in rays.chunks(BATCH) {
             self.take(rays);
             let (view, hits) = (&self.view, &mut self.hits);
             let _ = trace(view, self.isa, &mut self.room, &self.rays, hits, &mut go_on);
             for hit in hits {
-                distances.push(if hit.is_some() {
-                    hit.t / self.view.header.scale
-                } else {
-                    f64::INFINITY
-                });
+                let t = if hit.is_some() { hit.t } else { f64::INFINITY };
+                distances.push(t * from_units);
             }
         }
     }
 
     /// The same: 0 where anything is met before the ray's reach.
     pub fn block(&mut self, rays: &[[f32; 8]], distances: &mut Vec<f64>) {
+        distances.reserve(rays.len());
         for rays in rays.chunks(BATCH) {
             self.take(rays);
             let (aim, shares) = ((&[][..], &self.rays[..]), &mut self.shares);
