@@ -237,7 +237,10 @@ impl Drop for LineWriter {
 /// `rtfarm_worker=debug,warn`; lines up to `level` when it names none.
 fn filter(rust_log: Option<&str>, level: LevelFilter) -> Targets {
     let chosen = rust_log.and_then(|directives| directives.parse().ok());
-    chosen.unwrap_or_else(|| Targets::new().with_default(level))
+    // What libraries do in detail is for who asks for it by name.
+    let own =
+        Targets::new().with_default(level.min(LevelFilter::INFO)).with_target("rtfarm", level);
+    chosen.unwrap_or(own)
 }
 
 #[cfg(test)]
@@ -262,5 +265,13 @@ mod tests {
         check_levels(Some("info"), Level::INFO, Level::INFO);
         check_levels(Some("rtfarm_worker=debug,error"), Level::DEBUG, Level::ERROR);
         check_levels(Some("rtfarm_worker=loudly"), Level::WARN, Level::WARN);
+    }
+
+    #[test]
+    fn a_verbose_command_tells_what_it_does_and_not_what_its_libraries_do() {
+        let filter = filter(None, LevelFilter::DEBUG);
+        assert!(filter.would_enable("rtfarm_worker::run", &Level::DEBUG));
+        assert!(filter.would_enable("h2::codec", &Level::INFO));
+        assert!(!filter.would_enable("h2::codec", &Level::DEBUG));
     }
 }

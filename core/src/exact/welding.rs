@@ -1,9 +1,11 @@
 //! Points in one place become one.
 
+use std::sync::atomic::{AtomicU32, Ordering};
+
 use hashbrown::{HashTable, hash_table::Entry};
 use rayon::prelude::*;
 
-use super::hash::{HashFunction, Repeated};
+use super::hash::{HashFunction, groups_of_equal};
 
 /// The bits of a point's coordinates. Points are in one place where all their bits are equal, so
 /// zeros of either sign are two places.
@@ -50,57 +52,49 @@ impl PointTable {
         point: PointBits,
         point_at: impl Fn(u32) -> PointBits,
     ) -> Entry<'_, u32> {
-        self.entry_with_hash(self.hasher.hash(point), point, point_at)
-    }
-
-    /// Does the same for a point whose hash by the table's hasher is known.
-    #[inline(always)]
-    fn entry_with_hash(
-        &mut self,
-        hash: u64,
-        point: PointBits,
-        point_at: impl Fn(u32) -> PointBits,
-    ) -> Entry<'_, u32> {
         let Self { firsts, hasher } = self;
+        let hash = hasher.hash(point);
         firsts.entry(hash, |&index| point_at(index) == point, |&index| hasher.hash(point_at(index)))
     }
 }
 
-/// For every point, the first point in the same place, on rayon's threads.
+/// For every point, the first point in the same place, on rayon's threads. There are fewer than 2^32.
 pub(crate) fn find_firsts<P: Sync>(points: &[P], bits_of: fn(&P) -> PointBits) -> Vec<u32> {
     let hasher = PointHasher::new();
-    let hashes = || points.par_iter().map(|point| hasher.hash(bits_of(point)));
-    let repeated = Repeated::new(points.len(), hashes());
-    let points_of_hashes: Vec<(u64, u32)> = (hashes().zip(0..points.len() as u32))
-        .filter(|&(hash, _)| repeated.may_have(hash))
-        .collect();
-    // Each thread keeps the points of one share of all hashes; a point's share depends on its
-    // coordinates alone, so the answer does not depend on the number of shares.
-    let count = points_of_hashes.len();
-    let shares = if count < 1 << 14 { 1 } else { rayon::current_num_threads() };
-    let copies: Vec<Vec<(u32, u32)>> = (0..shares)
-        .into_par_iter()
-        .map(|share| {
-            let mut table = PointTable::new(hasher.clone(), count / shares);
-            let mut copies = Vec::new();
-            for &(hash, point) in &points_of_hashes {
-                if (hash >> 32) as usize % shares != share {
-                    continue;
-                }
-                let bits_at = |point: u32| bits_of(&points[point as usize]);
-                match table.entry_with_hash(hash, bits_at(point), bits_at) {
-                    Entry::Occupied(first) => copies.push((point, *first.get())),
-                    Entry::Vacant(place) => {
-                        place.insert(point);
-                    }
-                }
+    find_firsts_by(points, bits_of, |point| hasher.hash(point))
+}
+
+fn find_firsts_by<P: Sync>(
+    points: &[P],
+    bits_of: fn(&P) -> PointBits,
+    hash: impl Fn(PointBits) -> u64 + Sync,
+) -> Vec<u32> {
+    let bits_at = |point: u32| bits_of(&points[point as usize]);
+    let count = points.len() as u32;
+    let firsts: Vec<AtomicU32> = (0..count).into_par_iter().map(AtomicU32::new).collect();
+    let hash = |point| Some(hash(bits_at(point)));
+    groups_of_equal(
+        count,
+        hash,
+        |_| false,
+        |group, _: &mut Vec<()>| {
+            for &point in &group[1..] {
+                firsts[point as usize].store(group[0], Ordering::Relaxed);
             }
-            copies
-        })
+        },
+    );
+    let mut firsts: Vec<u32> = firsts.into_iter().map(AtomicU32::into_inner).collect();
+    // Points are compared in their own order, in which equal ones are mostly near each other in memory.
+    let strangers: Vec<u32> = (firsts.par_iter().zip(0..count))
+        .filter(|&(&first, point)| bits_at(first) != bits_at(point))
+        .map(|(_, point)| point)
         .collect();
-    let mut firsts: Vec<u32> = (0..points.len() as u32).into_par_iter().collect();
-    for (copy, first) in copies.into_iter().flatten() {
-        firsts[copy as usize] = first;
+    let mut table = PointTable::new(PointHasher::new(), strangers.len());
+    for point in strangers {
+        firsts[point as usize] = match table.entry(bits_at(point), bits_at) {
+            Entry::Occupied(first) => *first.get(),
+            Entry::Vacant(place) => *place.insert(point).get(),
+        };
     }
     firsts
 }
@@ -115,6 +109,9 @@ mod tests {
         for threads in [1, 2, 5] {
             let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
             let firsts = pool.install(|| find_firsts(&points, |&point| point));
+            let colliding =
+                pool.install(|| find_firsts_by(&points, |&point| point, |[_, y, _]| y << 61));
+            assert_eq!(firsts, colliding);
             for (point, &first) in firsts.iter().enumerate() {
                 assert_eq!(points[point], points[first as usize]);
                 assert_eq!(first as usize, point % 7000);

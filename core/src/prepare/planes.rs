@@ -12,7 +12,7 @@ use super::{
     flat::FlatFaces, near_planes::near_sets, plane_fingerprint::plane_fingerprints, ranks::Ranks,
 };
 use crate::{
-    exact::{hash::Repeated, predicates::is_coplanar},
+    exact::{hash::groups_of_equal, predicates::is_coplanar},
     prepared::record::{PlaneIndex, PlaneRecord},
 };
 
@@ -64,33 +64,41 @@ impl Sharing<'_> {
                 _ => [corners[0], corners[1], corners[2]],
             }
         });
-        let prints = fingerprints.par_iter().filter_map(|&print| print);
-        let repeated = Repeated::new(fingerprints.len(), prints);
-        let mut by_plane: Vec<(u64, u32, u32)> = fingerprints
-            .into_par_iter()
-            .enumerate()
-            .filter_map(|(face, print)| Some((print?, flat.rank(face), face as u32)))
-            .filter(|&(print, _, face)| match *flat.corners_of(face as usize) {
+        let is_quadrangle = |face: u32| face as usize >= flat.triangle_count;
+        let fingerprint = |face: u32| {
+            let is_flat = || match *flat.corners_of(face as usize) {
                 [a, b, c, d] => is_coplanar(a, b, c, d),
-                _ => repeated.may_have(print),
-            })
-            .collect();
-        by_plane.par_sort_unstable();
+                _ => true,
+            };
+            fingerprints[face as usize].filter(|_| !is_quadrangle(face) || is_flat())
+        };
+        let by_plane =
+            groups_of_equal(flat.count() as u32, fingerprint, is_quadrangle, |group, told| {
+                let start = told.len();
+                told.extend(group.iter().map(|&face| {
+                    let print = fingerprints[face as usize].expect("it has a plane");
+                    (print, flat.rank(face as usize), face)
+                }));
+                told[start..].sort_unstable();
+            });
         let groups: Vec<&[(u64, u32, u32)]> = by_plane
-            .chunk_by(|a, b| a.0 == b.0)
-            .filter(|group| group.len() > 1 || group[0].2 as usize >= flat.triangle_count)
+            .iter()
+            .flat_map(|told| told.chunk_by(|a, b| a.0 == b.0))
+            .filter(|group| group.len() > 1 || is_quadrangle(group[0].2))
             .collect();
         self.planes = groups.par_iter().map(|group| plane_of(flat, group[0].2 as usize)).collect();
-        let of_faces: Vec<(u32, PlaneIndex)> = (groups.par_iter().zip(&self.planes).enumerate())
-            .flat_map_iter(|(index, (group, plane))| {
-                group
-                    .iter()
-                    .map(move |&(_, _, face)| (face, index_for(flat, face as usize, index, plane)))
-            })
-            .collect();
-        for (face, index) in of_faces {
-            self.of_faces[face as usize] = Some(index);
+        for (index, group) in groups.iter().enumerate() {
+            for &(_, _, face) in *group {
+                self.of_faces[face as usize] = Some(PlaneIndex::new(index, false));
+            }
         }
+        // Which way they look is found face by face: neighbours are near each other in memory.
+        let planes = &self.planes;
+        self.of_faces.par_iter_mut().enumerate().for_each(|(face, plane)| {
+            if let Some(plane) = plane {
+                *plane = index_for(flat, face, plane.index(), &planes[plane.index()]);
+            }
+        });
     }
 
     /// Gives the other quadrangles, which are flat only within rounding, a record each; those with

@@ -77,7 +77,11 @@ impl FlatFaces {
         let places = |place: usize, item: u32| (4 * place as u32..).zip(self.gather(item as usize));
         order.par_iter().enumerate().for_each(|(place, &item)| {
             for (corner, &point) in places(place, item) {
-                numbers[point as usize].fetch_min(corner, Ordering::Relaxed);
+                let number = &numbers[point as usize];
+                // Mostly it is not the first, which a load tells far sooner.
+                if number.load(Ordering::Relaxed) > corner {
+                    number.fetch_min(corner, Ordering::Relaxed);
+                }
             }
         });
         let of_runs: Vec<Vec<u32>> = (order.par_chunks(NUMBERED_AT_ONCE).enumerate())

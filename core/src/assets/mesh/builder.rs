@@ -9,7 +9,7 @@ use glam::DVec3;
 use super::error::{MeshError, MeshFault};
 use crate::{
     exact::{
-        hash::{HashFunction, Repeated},
+        hash::{HashFunction, groups_of_equal},
         polygon,
         predicates::is_collinear,
         welding::{PointHasher, PointTable, find_firsts},
@@ -169,15 +169,21 @@ impl<T: Copy + Into<f64>> MeshBuilder<T> {
     fn drop_copies(&mut self) {
         let function = HashFunction::random();
         let triangles = &self.faces.triangles;
-        let hash = |&triangle: &[u32; 3]| function.hash(turned(triangle).map(u64::from));
-        let repeated = Repeated::new(triangles.len(), triangles.par_iter().map(hash));
-        let mut equal: Vec<([u32; 3], u32)> = (triangles.par_iter().zip(0..triangles.len() as u32))
-            .filter(|(triangle, _)| repeated.may_have(hash(triangle)))
-            .map(|(&triangle, index)| (turned(triangle), index))
-            .collect();
-        equal.par_sort_unstable();
-        let is_copy = |pair: &&[([u32; 3], u32)]| pair[0].0 == pair[1].0;
-        let mut copies: Vec<u32> = equal.windows(2).filter(is_copy).map(|pair| pair[1].1).collect();
+        let triangle = |index: u32| turned(triangles[index as usize]);
+        let hash = |index| Some(function.hash(triangle(index).map(u64::from)));
+        let copies = groups_of_equal(
+            triangles.len() as u32,
+            hash,
+            |_| false,
+            |group, copies| {
+                for (k, &index) in group.iter().enumerate() {
+                    if group[..k].iter().any(|&first| triangle(first) == triangle(index)) {
+                        copies.push(index);
+                    }
+                }
+            },
+        );
+        let mut copies = copies.concat();
         if copies.is_empty() {
             return;
         }
