@@ -129,7 +129,6 @@ impl<'a> Sampler<'a> {
             Pixel::new(colors[wide.index_of(x, y) as usize], around)
         };
         let mut chosen = Vec::new();
-        let mut pixels = Vec::new();
         let mut place_of = vec![None; far.pixel_count()];
         let mut is_near_extended = vec![false; far.pixel_count()];
         for (x, y) in near.pixels() {
@@ -137,11 +136,12 @@ impl<'a> Sampler<'a> {
             if round.verdicts[index as usize].is_done && !is_near_suspect[index as usize] {
                 continue;
             }
-            place_of[index as usize] = Some(pixels.len());
+            place_of[index as usize] = Some(chosen.len());
             far.neighbours(x, y).for_each(|index| is_near_extended[index as usize] = true);
             chosen.push(index);
-            pixels.push(new_pixel((x, y)));
         }
+        let mut pixels: Vec<Pixel> =
+            chosen.iter().map(|&index| new_pixel(far.pixel_at(index))).collect();
         self.extend(far, &chosen, 1..FEWEST_FOR_ERROR, FEWEST_FOR_ERROR, None, |place, color| {
             pixels[place].add(color);
         })?;

@@ -127,15 +127,16 @@ impl<'a> OnwardSearch<'a> {
         mut tools: Tools<'_, 'a, impl FnMut(u32, u32, UnseenFaces)>,
         look: &impl Fn(u32, u32) -> Option<FirstSample>,
     ) {
+        let mut looks = Vec::new();
         for square in area.squares_of_frame(SQUARES[0].0) {
-            let looks = square.common_pixels(area).filter_map(|(x, y)| {
+            looks.clear();
+            looks.extend(square.common_pixels(area).filter_map(|(x, y)| {
                 let first = look(x, y)?;
                 let surface = first.hit.face.surface(self.view);
                 Some(Look { x, y, first, surface, weight: 1.0 })
-            });
-            let looks = looks.collect();
+            }));
             self.beam = 0;
-            self.follow(screen, square, looks, 1, &mut tools);
+            self.follow(screen, square, &mut looks, 1, &mut tools);
         }
     }
 
@@ -145,7 +146,7 @@ impl<'a> OnwardSearch<'a> {
         &mut self,
         screen: &Screen,
         square: Area,
-        mut looks: Vec<Look>,
+        looks: &mut [Look],
         depth: u32,
         tools: &mut Tools<'_, 'a, impl FnMut(u32, u32, UnseenFaces)>,
     ) {
@@ -174,8 +175,9 @@ impl<'a> OnwardSearch<'a> {
                 let Some(seen) = seen else { continue };
                 self.search_way(&seen, &sheet, &next, tools);
                 if depth < MOST_SURFACES {
-                    let next = next.into_iter().filter(|look| look.first.hit.is_some()).collect();
-                    self.follow(&seen, square, next, depth + 1, tools);
+                    let mut next = next;
+                    next.retain(|look| look.first.hit.is_some());
+                    self.follow(&seen, square, &mut next, depth + 1, tools);
                 }
             }
         }
