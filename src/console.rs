@@ -1,5 +1,5 @@
-//! Standard error: log lines, the progress bar and a picture above it, which share it. Nobody here waits
-//! for who reads it.
+//! Standard error: log lines, the progress bar and a picture above it, which share it. Nobody here
+//! waits for who reads it.
 
 use std::{
     io::{self, IsTerminal, Write},
@@ -46,8 +46,8 @@ impl Console {
         Self::default()
     }
 
-    /// Standard error as a command uses it: with a bar on a terminal, with log lines elsewhere, unless
-    /// it is to be quiet or verbose. `RUST_LOG` chooses others.
+    /// Standard error as a command uses it: with a bar on a terminal, with log lines elsewhere,
+    /// unless it is to be quiet or verbose. `RUST_LOG` chooses others.
     pub(crate) fn new(args: &Args) -> Self {
         let Args { command, quiet: is_quiet, verbose: is_verbose } = args;
         let format = command.log_format();
@@ -104,7 +104,8 @@ impl Console {
         let _ = writeln!(self.make_writer(), "{line}");
     }
 
-    /// Writes a line to standard output; where that is a terminal, which may be the same one, in its turn.
+    /// Writes a line to standard output; where that is a terminal, which may be the same one, in
+    /// its turn.
     pub(crate) fn answer(&self, line: &str) -> io::Result<()> {
         let mut out = io::stdout();
         match &self.queue {
@@ -237,7 +238,10 @@ impl Drop for LineWriter {
 /// `rtfarm_worker=debug,warn`; lines up to `level` when it names none.
 fn filter(rust_log: Option<&str>, level: LevelFilter) -> Targets {
     let chosen = rust_log.and_then(|directives| directives.parse().ok());
-    chosen.unwrap_or_else(|| Targets::new().with_default(level))
+    // What libraries do in detail is for who asks for it by name.
+    let own =
+        Targets::new().with_default(level.min(LevelFilter::INFO)).with_target("rtfarm", level);
+    chosen.unwrap_or(own)
 }
 
 #[cfg(test)]
@@ -262,5 +266,13 @@ mod tests {
         check_levels(Some("info"), Level::INFO, Level::INFO);
         check_levels(Some("rtfarm_worker=debug,error"), Level::DEBUG, Level::ERROR);
         check_levels(Some("rtfarm_worker=loudly"), Level::WARN, Level::WARN);
+    }
+
+    #[test]
+    fn a_verbose_command_tells_what_it_does_and_not_what_its_libraries_do() {
+        let filter = filter(None, LevelFilter::DEBUG);
+        assert!(filter.would_enable("rtfarm_worker::run", &Level::DEBUG));
+        assert!(filter.would_enable("h2::codec", &Level::INFO));
+        assert!(!filter.would_enable("h2::codec", &Level::DEBUG));
     }
 }

@@ -34,7 +34,6 @@ mod worker;
 
 use std::process::ExitCode;
 
-use clap::Parser;
 use rtfarm_proto::wire::{Nothing, Standing, control_request::Change};
 use tokio::signal::unix::{SignalKind, signal};
 use tokio_util::sync::CancellationToken;
@@ -57,7 +56,7 @@ static ALLOCATOR: memory::LargePages = memory::LargePages;
 
 fn main() -> ExitCode {
     memory::return_what_is_freed();
-    let args = match Args::try_parse() {
+    let args = match Args::read() {
         Ok(args) => args,
         Err(error) => return failure::explain_usage(&error),
     };

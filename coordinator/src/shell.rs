@@ -1,6 +1,8 @@
 //! The shell of the machine: it hands events to it, with the time, and does what it answers.
 //! Nothing is decided here.
 
+mod log;
+
 use std::{
     collections::{BTreeMap, BTreeSet, HashMap},
     future::pending,
@@ -14,7 +16,7 @@ use rtfarm_core::{
     prepared::SceneHash,
     tile::{TileGrid, TileId},
 };
-use rtfarm_job::{FinishedTile, Order, Outcome, Progress};
+use rtfarm_job::{Order, Outcome, Progress};
 use rtfarm_picture::{Canvas, CanvasTile, TileRecord};
 use rtfarm_proto::{Bytes, Incarnation, JobId, LeaseName, Renewal, WorkerId};
 use tokio::sync::{Notify, oneshot};
@@ -35,7 +37,7 @@ use crate::{
     record::{Plan, Ticket},
     state::{Durability, KeptJob, StateFolder},
     store::SceneFile,
-    tiles::{MOST_LOSSES, Tiles},
+    tiles::Tiles,
     upload::OrderLimits,
     waiting::{Ask, AskId},
 };
@@ -324,7 +326,8 @@ impl Shell {
                 }
             }
             Action::TakeBack(job, tiles) => {
-                // At once, though it writes: what comes of these tiles next must not be cleared. It is rare.
+                // At once, though it writes: what comes of these tiles next must not be cleared. It
+                // is rare.
                 if let Some(known) = state.jobs.get(&job)
                     && let Err(error) = known.canvas.clear(&tiles)
                 {
@@ -351,7 +354,7 @@ impl Shell {
         match work {
             Work::Log(notice) => {
                 self.events.on_notice(&notice);
-                log(*notice);
+                log::log(*notice);
             }
             Work::Drop(job) => job.forget(),
             Work::Reopen(job) => job.reopen(),
@@ -468,8 +471,8 @@ impl Shell {
         self.tell(|state, _| state.farm.on_call(Incarnation(incarnation)))
     }
 
-    /// Lets a client's call in that is meant for this farm. Who knows only the number of a job names
-    /// none.
+    /// Lets a client's call in that is meant for this farm. Who knows only the number of a job
+    /// names none.
     pub(crate) fn admit_client(&self, farm: &[u8]) -> Result<(), Stranger> {
         let Identity { farm: ours, incarnation } = self.identity;
         let is_ours = farm.is_empty() || farm == ours.0;
@@ -554,8 +557,8 @@ impl Shell {
         self.tell_farm(|farm, now| farm.on_process_exit(process, reason, now));
     }
 
-    /// Takes an order, or finds the job of an earlier one with the same key. This writes files: never
-    /// call it on the async runtime.
+    /// Takes an order, or finds the job of an earlier one with the same key. This writes files:
+    /// never call it on the async runtime.
     pub(crate) fn submit(&self, order: Order, ticket: Ticket) -> Result<Arc<Job>, SubmitError> {
         let _alone = self.changing.lock().expect("writing never panics");
         if let Some(job) = self.claim(&ticket)? {
@@ -582,8 +585,8 @@ impl Shell {
         Ok(job)
     }
 
-    /// The job that the account's earlier order with the same key has, which another client is told of
-    /// now. It fails if that order was another one.
+    /// The job that the account's earlier order with the same key has, which another client is told
+    /// of now. It fails if that order was another one.
     pub(crate) fn claim(&self, ticket: &Ticket) -> Result<Option<Arc<Job>>, SubmitError> {
         let Ticket { account, key, wanted, .. } = ticket;
         let has_key = |of: &Ticket| !key.is_empty() && (&of.account, &of.key) == (account, key);
@@ -639,8 +642,8 @@ impl Shell {
     }
 
     /// The job of a coarse picture of what another job renders, before all others: it is made when
-    /// there is none. Nobody is told of it but those who watch. This writes a file: never call it on
-    /// the async runtime.
+    /// there is none. Nobody is told of it but those who watch. This writes a file: never call it
+    /// on the async runtime.
     pub(crate) fn coarse(&self, of: &Arc<Job>) -> Option<Arc<Job>> {
         let id = coarse_id(of.id);
         if let Some(known) = self.job(id) {
@@ -869,125 +872,5 @@ impl Drop for Line<'_> {
         if state.asks.remove(&self.id).is_some() {
             state.farm.on_hang_up(self.id);
         }
-    }
-}
-
-fn log(notice: Notice) {
-    match notice {
-        Notice::Joined(worker, Process { host, number, threads, isa, .. }) => {
-            tracing::info!(
-                worker = worker.0,
-                host,
-                process = number,
-                threads,
-                isa,
-                "worker joined"
-            );
-        }
-        Notice::Gone(worker, reason) => {
-            tracing::info!(worker = worker.0, reason, "worker gone");
-        }
-        Notice::LeaseLost(loss, reason) => tracing::warn!(
-            worker = loss.worker.0,
-            tiles = %list(&loss.tiles),
-            reason,
-            job = loss.lease.job.0,
-            lease = loss.lease.id.0,
-            "lease lost"
-        ),
-        Notice::SetAside(job, tile) => tracing::error!(
-            job = job.0,
-            tile = tile.number(),
-            "a tile is set aside: too many workers were lost with it, or stood still"
-        ),
-        Notice::TileDone { delivery, progress, elapsed } => {
-            let Delivery { worker, tile, seconds, tally, .. } = delivery;
-            let (worker, rays) = (Some(worker.0), tally.rays);
-            FinishedTile { tile, worker, seconds, rays }.log(&progress, elapsed);
-        }
-        Notice::CopiesDiffer { second, first } => tracing::error!(
-            worker = second.worker.0,
-            tile = second.tile.number(),
-            other = first.worker.0,
-            first = %blake3::Hash::from_bytes(first.hash),
-            second = %blake3::Hash::from_bytes(second.hash),
-            "two copies of a tile differ; one of their workers is broken"
-        ),
-        Notice::Liar { worker, job, tile } => tracing::error!(
-            worker = worker.0,
-            job = job.0,
-            tile = tile.number(),
-            "a worker brought pixels that two others contradict; it is kept out from now on"
-        ),
-        Notice::TakenBack { worker, job, tiles } => tracing::warn!(
-            worker = worker.0,
-            job = job.0,
-            tiles = %list(&tiles),
-            "tiles of a worker that is kept out are rendered again"
-        ),
-        Notice::NoAudit => {
-            tracing::warn!("tiles are not compared: nobody is there to render them again");
-        }
-        Notice::NotCompared(job, tile) => tracing::warn!(
-            job = job.0,
-            tile = tile.number(),
-            "the tile is not compared: {MOST_LOSSES} workers that rendered it again were lost"
-        ),
-        Notice::JobFailed(job, reason) => tracing::warn!(job = job.0, reason, "job failed"),
-        Notice::NotGranted { worker, lease, tile, count } => {
-            tracing::warn!(
-                worker = worker.0,
-                job = lease.job.0,
-                lease = lease.id.0,
-                tile = tile.number(),
-                count,
-                "pixels came that nobody was to render so"
-            );
-        }
-        Notice::Suspect { worker, job, tile, reason } => tracing::error!(
-            worker = worker.0,
-            job = job.0,
-            tile = tile.number(),
-            reason,
-            "a worker brought pixels that make no sense"
-        ),
-        Notice::Strangers(count) => {
-            tracing::warn!(count, "calls meant for another start of a coordinator were refused");
-        }
-        Notice::JobExpired(job) => {
-            tracing::info!(job = job.0, "job forgotten: it was kept long enough");
-        }
-        Notice::JobChanged(job, change) => tracing::info!(job = job.0, ?change, "job changed"),
-        Notice::Stationed(worker, standing) => {
-            tracing::info!(worker = worker.0, ?standing, "worker's standing changed");
-        }
-        Notice::NoRoom(job, reason) => tracing::warn!(job = job.0, reason, "job waits"),
-        Notice::JobCancelled(job) => tracing::info!(job = job.0, "job cancelled"),
-    }
-}
-
-/// Lists tile numbers in ascending order, runs of neighbours as spans: `3,17-24`.
-fn list(tiles: &[TileId]) -> String {
-    let mut numbers: Vec<u32> = tiles.iter().map(|tile| tile.number()).collect();
-    numbers.sort_unstable();
-    let spans = numbers.chunk_by(|a, b| a + 1 == *b).map(|span| match span {
-        [only] => only.to_string(),
-        span => format!("{}-{}", span[0], span[span.len() - 1]),
-    });
-    spans.collect::<Vec<String>>().join(",")
-}
-
-#[cfg(test)]
-mod tests {
-    use rtfarm_core::tile::{Size, TileGrid};
-
-    use super::*;
-
-    #[test]
-    fn tiles_are_listed_as_spans() {
-        let grid = TileGrid::new(Size::new(160, 160).unwrap(), 16).unwrap();
-        let tiles: Vec<TileId> =
-            [24, 3, 18, 17, 19, 99].iter().map(|&number| grid.tile(number).unwrap()).collect();
-        assert_eq!(list(&tiles), "3,17-19,24,99");
     }
 }

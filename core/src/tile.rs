@@ -300,6 +300,14 @@ impl TileGrid {
             .expect("five sides were tried")
     }
 
+    /// The same window in tiles of twice the side, unless they are above 64 pixels or fewer than 150
+    /// then: where first samples are taken around a tile, too, larger ones need fewer of them.
+    #[must_use]
+    pub fn with_less_rim(self) -> Self {
+        let wider = Self { side: 2 * self.side, ..self };
+        if wider.side <= 64 && wider.count() >= 150 { wider } else { self }
+    }
+
     /// The pixels that are cut.
     pub fn window(self) -> Area {
         self.window
@@ -431,6 +439,16 @@ mod tests {
         assert_eq!(TileGrid::balanced(Size::new(1280, 720).unwrap()).side(), 32);
         assert_eq!(TileGrid::balanced(Size::new(16_384, 16_384).unwrap()).side(), 256);
         assert_eq!(TileGrid::balanced(Size::new(1, 1).unwrap()).count(), 1);
+    }
+
+    #[test]
+    fn sides_are_doubled_where_enough_tiles_are_left() {
+        for (width, height, side) in
+            [(1280, 720, 64), (640, 360, 32), (400, 300, 16), (1920, 1080, 64)]
+        {
+            let grid = TileGrid::balanced(Size::new(width, height).unwrap()).with_less_rim();
+            assert_eq!(grid.side(), side, "{width}x{height}");
+        }
     }
 
     #[test]

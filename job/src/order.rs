@@ -4,7 +4,7 @@ use rtfarm_core::{
     language::{Diagnostic, Omitted, Reading, Resolve, read_scene_with},
     prepare::{Form, PrepareError, prepare_as},
     prepared::PreparedBytes,
-    render::{Quality, Settings},
+    render::{Quality, Sampling, Settings},
     scene::Scene,
     tile::{Area, Crop, Size, TileGrid},
     transfer::Transfer,
@@ -123,7 +123,10 @@ impl RenderRequest {
         };
         let grid = match self.tile_side {
             Some(side) => TileGrid::new(window, side).map_err(|error| other(error.to_string()))?,
-            None => TileGrid::balanced(window),
+            None => match self.quality.sampling {
+                Sampling::Fixed(_) => TileGrid::balanced(window),
+                Sampling::Adaptive { .. } => TileGrid::balanced(window).with_less_rim(),
+            },
         };
         if grid.count() > MOST_TILES {
             return Err(other(format!(

@@ -30,6 +30,9 @@ use tempfile::TempDir;
 const SLOW: [&str; 6] = ["--size", "160x120", "--samples", "1024", "--tile", "8"];
 const SLOW_TILE_COUNT: usize = 20 * 15;
 
+/// The same picture with so many samples that nothing here waits for its end.
+const ENDLESS: [&str; 6] = ["--size", "160x120", "--samples", "65536", "--tile", "8"];
+
 /// How long anything here may take, on a machine that has much else to do.
 const PATIENCE: Duration = Duration::from_secs(240);
 
@@ -202,7 +205,8 @@ impl Process {
     }
 }
 
-/// An address that a coordinator may come back to: the system gives its port to nobody who asks for any.
+/// An address that a coordinator may come back to: the system gives its port to nobody who asks for
+/// any.
 fn own_address() -> String {
     static NEXT: AtomicU32 = AtomicU32::new(0);
     let range = fs::read_to_string("/proc/sys/net/ipv4/ip_local_port_range").unwrap();
@@ -318,8 +322,18 @@ fn a_picture_in_a_given_time_can_be_had_again() {
     assert!(place.render("out.png", &[&common[..], &quality].concat()) == timed, "{quality:?}");
 }
 
+/// Whether a log says that this worker lost tiles for this reason.
+fn tells_of_lost_lease(log: &str, worker: u32, reason: &str) -> bool {
+    log.lines().any(|line| {
+        line.contains("lease lost")
+            && line.contains(&format!(" worker={worker} tiles="))
+            && line.contains(&format!("reason=\"{reason}\""))
+    })
+}
+
 #[test]
 fn a_killed_and_a_stopped_worker_change_nothing() {
+    const STOPPED: &str = "no progress for 2.0 s";
     let place = Place::new();
     let farm = ["--workers", "3", "--threads", "1", "--lease-seconds", "2"];
     let args = [&["render", "scene.rt", "-o", "out.png"], &SLOW[..], &farm].concat();
@@ -328,20 +342,29 @@ fn a_killed_and_a_stopped_worker_change_nothing() {
     let workers = render.workers();
     kill_process(pid(workers[0].1), Signal::KILL).unwrap();
     kill_process(pid(workers[1].1), Signal::STOP).unwrap();
+    // The others stand still as well until that one is found out, or they might have done all by
+    // then.
+    let mut resting = BTreeSet::from([workers[0].1, workers[1].1]);
+    poll(|| {
+        for (_, process) in render.workers() {
+            if resting.insert(process) {
+                let _ = kill_process(pid(process), Signal::STOP);
+            }
+        }
+        tells_of_lost_lease(&render.log(), workers[1].0, STOPPED).then_some(())
+    });
+    for &process in &resting {
+        if process != workers[1].1 {
+            let _ = kill_process(pid(process), Signal::CONT);
+        }
+    }
     let status = render.wait();
     let log = render.log();
     assert!(status.success(), "{log}");
 
     check_each_tile_once(&log, SLOW_TILE_COUNT);
-    for ((worker, _), reason) in
-        workers.iter().zip(["reason=\"killed by signal 9\"", "reason=\"no progress for 2.0 s\""])
-    {
-        let is_told = |line: &str| {
-            line.contains("lease lost")
-                && line.contains(&format!(" worker={worker} tiles="))
-                && line.contains(reason)
-        };
-        assert!(log.lines().any(is_told), "{worker} {reason}: {log}");
+    for (worker, reason) in [(workers[0].0, "killed by signal 9"), (workers[1].0, STOPPED)] {
+        assert!(tells_of_lost_lease(&log, worker, reason), "{worker} {reason}: {log}");
     }
     for (_, process) in workers {
         wait_for_end_of(process);
@@ -354,7 +377,7 @@ fn a_killed_and_a_stopped_worker_change_nothing() {
 #[test]
 fn workers_that_die_are_replaced_and_without_any_a_render_fails_and_says_why() {
     let place = Place::new();
-    let args = [&["render", "scene.rt", "-o", "out.png", "--workers", "1"], &SLOW[..]].concat();
+    let args = [&["render", "scene.rt", "-o", "out.png", "--workers", "1"], &ENDLESS[..]].concat();
     let mut render = place.start("render.log", &args);
     poll(|| (render.tiles_done() >= 1).then_some(()));
     for count in 0..4 {
@@ -451,7 +474,8 @@ fn a_coordinator_killed_and_started_again_gives_the_next_picture_no_pixel_of_the
     let url = line.trim().strip_prefix("listening on ").expect(&line);
     let worker = ["worker", "--threads", "2", "--patience", "60", "--coordinator", url];
     let workers = ["a.log", "b.log", "c.log"].map(|log| place.start(log, &worker));
-    let args = [&["submit", "scene.rt", "-o", "out.png", "--coordinator", url], &SLOW[..]].concat();
+    let args =
+        [&["submit", "scene.rt", "-o", "out.png", "--coordinator", url], &ENDLESS[..]].concat();
     let _lost = place.start("lost.log", &args);
     poll(|| (first.tiles_done() >= 20 && first.workers().len() == 3).then_some(()));
     // Each has tiles in hand that it brings once it goes on.
@@ -601,7 +625,8 @@ fn an_interrupted_submit_ends_its_job() {
     let line = coordinator.read_line();
     let url = line.trim().strip_prefix("listening on ").expect(&line);
     let _worker = place.start("worker.log", &["worker", "--threads", "1", "--coordinator", url]);
-    let args = [&["submit", "scene.rt", "-o", "out.png", "--coordinator", url], &SLOW[..]].concat();
+    let args =
+        [&["submit", "scene.rt", "-o", "out.png", "--coordinator", url], &ENDLESS[..]].concat();
     let mut submit = place.start("submit.log", &args);
     poll(|| (coordinator.tiles_done() >= 3).then_some(()));
     submit.signal(Signal::INT);
@@ -623,7 +648,7 @@ fn an_interrupted_render_leaves_nothing() {
     let place = Place::new();
     for (signal, here) in [(Signal::INT, "2"), (Signal::TERM, "2"), (Signal::INT, "0")] {
         let args =
-            [&["render", "scene.rt", "-o", "out.png", "--workers", here], &SLOW[..]].concat();
+            [&["render", "scene.rt", "-o", "out.png", "--workers", here], &ENDLESS[..]].concat();
         let mut render = place.start("render.log", &args);
         poll(|| (render.tiles_done() >= 3).then_some(()));
         let workers = render.workers();
@@ -645,7 +670,7 @@ fn an_interrupted_render_leaves_nothing() {
 #[test]
 fn workers_die_with_a_killed_coordinator() {
     let place = Place::new();
-    let args = [&["render", "scene.rt", "-o", "out.png", "--workers", "2"], &SLOW[..]].concat();
+    let args = [&["render", "scene.rt", "-o", "out.png", "--workers", "2"], &ENDLESS[..]].concat();
     let mut render = place.start("render.log", &args);
     poll(|| (render.tiles_done() >= 1 && render.workers().len() == 2).then_some(()));
     let workers = render.workers();
@@ -663,7 +688,7 @@ fn workers_die_with_a_killed_coordinator() {
 #[test]
 fn a_worker_that_stays_stopped_is_replaced() {
     let place = Place::new();
-    let args = [&["render", "scene.rt", "-o", "out.png", "--workers", "1"], &SLOW[..]].concat();
+    let args = [&["render", "scene.rt", "-o", "out.png", "--workers", "1"], &ENDLESS[..]].concat();
     let mut render = place.start("render.log", &args);
     poll(|| (render.tiles_done() >= 1).then_some(()));
     kill_process(pid(render.workers()[0].1), Signal::STOP).unwrap();
@@ -705,7 +730,7 @@ fn bad_input_gives_one_clear_line_and_an_exit_code() {
         ("scene.rt", "o.png", "--size=1e3x5", 2, "a size looks like 1280x720"),
         ("scene.rt", "o.png", "--crop=1,2,3", 2, "a crop window looks like 320,180,640,360"),
         ("scene.rt", "o.png", "--crop=0,0,9999,1", 2, "does not have all of the crop window"),
-        ("scene.rt", "o.png", "--tile=2", 2, "2 is not in 4..=1024"),
+        ("scene.rt", "o.png", "--tile=2", 2, "must be a whole number from 4 to 1024"),
         ("scene.rt", "o.png", "--samples=0", 2, "must be a whole number from 1 to 65536"),
         ("scene.rt", "o.png", "--error=0", 2, "must be a number above 0 and at most 1"),
         ("scene.rt", "o.png", "--max-samples=7", 2, "must be a whole number from 8 to 65536"),
@@ -722,6 +747,17 @@ fn bad_input_gives_one_clear_line_and_an_exit_code() {
         2,
         "'rendr'; tip: some similar subcommands exist: 'report', 'retry', 'render'",
     );
+    for (option, reason) in [
+        ("--error", "must be a number above 0 and at most 1"),
+        ("--samples", "must be a whole number from 1 to 65536"),
+        ("--time", "a time is from 0.1 to 86400 seconds"),
+        ("--workers", "must be a whole number from 0 to 256"),
+        ("--seed", "must be a whole number from 0 to 18446744073709551615"),
+        ("--tile", "must be a whole number from 4 to 1024"),
+    ] {
+        let args = ["render", "scene.rt", "-o", "o.png", option, "-1"];
+        check_refused(&place, &args, 2, reason);
+    }
     check_refused(&place, &["render", "scene.rt"], 2, "--output <FILE>");
     let huge = ["render", "scene.rt", "-o", "o.png", "--size", "65535x65535", "--tile", "4"];
     check_refused(&place, &huge, 2, "at most 1048576 tiles");

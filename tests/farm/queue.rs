@@ -76,9 +76,9 @@ fn people_can_live_with_the_queue() {
 
     // Two jobs that nobody renders yet, one of them ordered twice under a key.
     let named = ["--name", "my picture", "--owner", "anna", "--max-workers", "2"];
-    let first = detach(&place, &url, &[&SLOW[..], &named].concat());
-    let second = detach(&place, &url, &[&SLOW[..], &["--key", "a key"]].concat());
-    assert_eq!(detach(&place, &url, &[&SLOW[..], &["--key", "a key"]].concat()), second);
+    let first = detach(&place, &url, &[&ENDLESS[..], &named].concat());
+    let second = detach(&place, &url, &[&ENDLESS[..], &["--key", "a key"]].concat());
+    assert_eq!(detach(&place, &url, &[&ENDLESS[..], &["--key", "a key"]].concat()), second);
     assert_eq!(order(&place, &url), [&first[..], &second]);
     let of_first = entry(&place, &url, &first);
     assert_eq!(of_first["name"], "my picture");
@@ -110,7 +110,7 @@ fn people_can_live_with_the_queue() {
     let of_second = entry(&place, &url, &second);
     assert_eq!((&of_second["state"], &of_second["priority"]), (&"paused".into(), &5.into()));
     assert_eq!(entry(&place, &url, &first)["name"], "my picture");
-    assert_eq!(detach(&place, &url, &[&SLOW[..], &["--key", "a key"]].concat()), second);
+    assert_eq!(detach(&place, &url, &[&ENDLESS[..], &["--key", "a key"]].concat()), second);
 
     // The paused one rests though it comes first; what there is of the other can be seen.
     let start = |log: &str| place.start(log, &["worker", "--threads", "1", "--coordinator", &url]);

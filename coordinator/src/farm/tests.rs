@@ -1,6 +1,13 @@
-use rtfarm_core::tile::{Size, TileGrid};
+//! A farm under a clock of the test, with workers played by hand or by chance.
+
+use rtfarm_core::{
+    render::Tally,
+    tile::{Size, TileGrid},
+};
+use rtfarm_job::{Outcome, Progress};
 
 use super::*;
+use crate::{members::Standing, tiles::Tiles};
 
 const TERM: Duration = Duration::from_secs(4);
 const SECOND: Duration = Duration::from_secs(1);

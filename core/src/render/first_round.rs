@@ -2,7 +2,9 @@
 
 use glam::{BVec3, DVec3};
 
-use super::pixel::{Around, CERTAIN, HIDDEN, Neighbourhood, Pixel, SHADES, Wanted};
+use super::pixel::{
+    Around, CERTAIN, CROSSED_BY_EDGE, HIDDEN, Neighbourhood, Pixel, SHADES, Wanted,
+};
 use crate::{
     isa::Isa,
     tile::Area,
@@ -22,18 +24,20 @@ pub(super) struct FirstRound {
     pub(super) verdicts: Vec<Verdict>,
 }
 
-/// What follows for a pixel, as [`Pixel::is_done`] and [`Pixel::is_suspect`] say.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+/// What follows for a pixel, as [`Pixel::is_done`], [`Pixel::is_suspect`] and [`Pixel::estimate`] say.
+#[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Verdict {
     pub(super) is_done: bool,
     pub(super) is_suspect: bool,
+    /// The variance of its mean, where neighbours have no more samples and nothing hides.
+    pub(super) variance: Option<DVec3>,
 }
 
 impl FirstRound {
     /// Tells the pixels of `area`; `colors` are the samples of `wide`, which has their neighbours.
     pub(super) fn new(area: Area, wide: Area, colors: &[DVec3], wanted: &Wanted, isa: Isa) -> Self {
         let count = area.pixel_count();
-        let no_verdict = Verdict { is_done: false, is_suspect: true };
+        let no_verdict = Verdict { is_done: false, is_suspect: true, variance: None };
         let nothing = Around { variance: None, contrast: DVec3::ZERO, is_edge: BVec3::FALSE };
         let mut round = Self { around: vec![nothing; count], verdicts: vec![no_verdict; count] };
         let frame = area.frame();
@@ -67,8 +71,11 @@ impl FirstRound {
         let around = Neighbourhood::new(wide, x, y, colors).around();
         let pixel = Pixel::new(colors[wide.index_of(x, y) as usize], around);
         self.around[index] = around;
-        self.verdicts[index] =
-            Verdict { is_done: pixel.is_done(wanted), is_suspect: pixel.is_suspect(wanted) };
+        self.verdicts[index] = Verdict {
+            is_done: pixel.is_done(wanted),
+            is_suspect: pixel.is_suspect(wanted),
+            variance: pixel.estimate(wanted).variance,
+        };
     }
 }
 
@@ -105,7 +112,7 @@ impl InLanes<'_> {
         let Wanted { error, full_light } = *self.wanted;
         let (mut variances, mut contrasts) = ([[0.0; AT_ONCE]; 3], [[0.0; AT_ONCE]; 3]);
         let mut edges = [[false; AT_ONCE]; 3];
-        let mut clipped = [[0.0; AT_ONCE]; 3];
+        let (mut clipped, mut told) = ([[0.0; AT_ONCE]; 3], [[0.0; AT_ONCE]; 3]);
         for channel in 0..3 {
             let mut nine = [[0.0; AT_ONCE]; NINE];
             for (k, lanes) in nine.iter_mut().enumerate() {
@@ -132,8 +139,12 @@ impl InLanes<'_> {
                 let variance = if is_even { 0.0 } else { variances[channel][lane] };
                 variances[channel][lane] = variance;
                 let least = self.planes[channel][middle] - CERTAIN * variance.sqrt();
-                clipped[channel][lane] =
-                    if least >= full_light { 0.0 } else { variance.min(full_light * full_light) };
+                let clip = |variance: f64| {
+                    if least >= full_light { 0.0 } else { variance.min(full_light * full_light) }
+                };
+                let crossed = if edges[channel][lane] { CROSSED_BY_EDGE } else { 1.0 };
+                clipped[channel][lane] = clip(variance);
+                told[channel][lane] = clip(variance * crossed);
             }
         }
         let first = self.area.index_of(x, y) as usize;
@@ -150,6 +161,7 @@ impl InLanes<'_> {
             self.round.verdicts[first + lane] = Verdict {
                 is_done: most < error * error,
                 is_suspect: HIDDEN * most > error * error,
+                variance: Some(vector(&told)),
             };
         }
     }

@@ -217,7 +217,7 @@ const CROSSED_AT_FIRST: f64 = 0.3;
 /// whose sample's variance is c²/6 on average. The plane through samples around it takes it for
 /// noise of all three pixels beside it, which adds up to 1.67 times as much: measured on spheres and
 /// polygons.
-const CROSSED_BY_EDGE: f64 = 0.6;
+pub(super) const CROSSED_BY_EDGE: f64 = 0.6;
 
 /// Two shades lie this many times as far apart as what they differ in themselves, or more.
 pub(super) const SHADES: f64 = 16.0;

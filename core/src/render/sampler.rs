@@ -120,23 +120,28 @@ impl<'a> Sampler<'a> {
         // Where the first samples lie apart the pixels around get more, and what these see opens the
         // pixels beside them: an edge may cross a corner that no first sample met.
         let round = FirstRound::new(far, wide, &colors, wanted, self.isa);
-        let is_open = |&(x, y): &(u32, u32)| {
-            !round.verdicts[far.index_of(x, y) as usize].is_done
-                || far.neighbours(x, y).any(|pixel| round.verdicts[pixel as usize].is_suspect)
-        };
+        let mut is_near_suspect = vec![false; far.pixel_count()];
+        for ((x, y), _) in far.pixels().zip(&round.verdicts).filter(|(_, told)| told.is_suspect) {
+            far.neighbours(x, y).for_each(|index| is_near_suspect[index as usize] = true);
+        }
         let new_pixel = |(x, y)| {
             let around = round.around[far.index_of(x, y) as usize];
             Pixel::new(colors[wide.index_of(x, y) as usize], around)
         };
         let mut chosen = Vec::new();
-        let mut pixels = Vec::new();
         let mut place_of = vec![None; far.pixel_count()];
-        for (x, y) in near.pixels().filter(is_open) {
+        let mut is_near_extended = vec![false; far.pixel_count()];
+        for (x, y) in near.pixels() {
             let index = far.index_of(x, y);
-            place_of[index as usize] = Some(pixels.len());
+            if round.verdicts[index as usize].is_done && !is_near_suspect[index as usize] {
+                continue;
+            }
+            place_of[index as usize] = Some(chosen.len());
+            far.neighbours(x, y).for_each(|index| is_near_extended[index as usize] = true);
             chosen.push(index);
-            pixels.push(new_pixel((x, y)));
         }
+        let mut pixels: Vec<Pixel> =
+            chosen.iter().map(|&index| new_pixel(far.pixel_at(index))).collect();
         self.extend(far, &chosen, 1..FEWEST_FOR_ERROR, FEWEST_FOR_ERROR, None, |place, color| {
             pixels[place].add(color);
         })?;
@@ -145,11 +150,19 @@ impl<'a> Sampler<'a> {
         let mut estimates = Vec::with_capacity(area.pixel_count());
         let mut open = Vec::new();
         for (index, (x, y)) in (0..).zip(area.pixels()) {
+            let here = far.index_of(x, y);
+            let unseen = found.next_if(|&(at, _)| at == index).map(|(_, unseen)| unseen);
+            // Where no neighbour has more than one sample and nothing hides the verdict stands.
+            if !is_near_extended[here as usize] && unseen.is_none() {
+                let (mean, variance) =
+                    (colors[wide.index_of(x, y) as usize], round.verdicts[here as usize].variance);
+                estimates.push(Estimate { mean, variance });
+                continue;
+            }
             let around = far.neighbours(x, y);
-            let own = extended(far.index_of(x, y));
+            let own = extended(here);
             let mut pixel = own.copied().unwrap_or_else(|| new_pixel((x, y)));
-            // Where no neighbour has more than one sample their contrast is known.
-            if around.clone().any(|index| extended(index).is_some()) {
+            if is_near_extended[here as usize] {
                 let first = |index| {
                     let (x, y) = far.pixel_at(index);
                     [colors[wide.index_of(x, y) as usize]; 2]
@@ -160,7 +173,6 @@ impl<'a> Sampler<'a> {
                     pixel.set_noise(&around.filter_map(extended));
                 }
             }
-            let unseen = found.next_if(|&(at, _)| at == index).map(|(_, unseen)| unseen);
             let mut pixel = OpenPixel { index, pixel, unseen };
             pixel.note_samples(search.as_ref(), area, seed, 1);
             estimates.push(pixel.pixel.estimate(wanted));

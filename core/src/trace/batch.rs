@@ -8,12 +8,12 @@ use std::ops::ControlFlow;
 use super::{
     box_ray::BoxRay,
     boxes::{BoxKernel, KernelWork},
-    hit::{Nearest, between, is_between, take_crossing, take_quadrangle, take_sphere},
+    hit::{Nearest, between, is_between, take, take_crossing, take_quadrangle, take_sphere},
     kernels::run_with_kernel,
-    lanes::{CLASSES, MOST_RAYS},
+    lanes::{CLASSES, LANES, MOST_RAYS, RayGroup},
     lone::{Flights, visit_alone},
     meeting::Meeting,
-    packet::{Packet, PacketStack, visit_packet},
+    packet::{Packet, PacketStack, places, visit_packet},
     ray::{Hit, Ray, Shear},
     solid::Scratch,
     traversal::{Stack, Step},
@@ -21,9 +21,9 @@ use super::{
 use crate::{
     isa::Isa,
     prepared::{
-        face::Face,
+        face::{Face, Part},
         layout::View,
-        record::{Item, Surface},
+        record::{Item, Kind, Surface},
     },
 };
 
@@ -216,6 +216,8 @@ struct NearestOfPacket<'a, K> {
 }
 
 impl<K: BoxKernel> Meeting for NearestOfPacket<'_, K> {
+    const ENDS: bool = false;
+
     #[inline(always)]
     fn cross(&mut self, place: usize, item: Item, t: f64) -> Step {
         let member = usize::from(self.members[place]);
@@ -225,6 +227,37 @@ impl<K: BoxKernel> Meeting for NearestOfPacket<'_, K> {
         } else {
             Step::Past
         }
+    }
+
+    #[inline(always)]
+    fn cross_group(
+        &mut self,
+        (group, first): (&mut RayGroup, usize),
+        [crossing, within]: [u64; 2],
+        item: Item,
+        distances: &[f64; LANES],
+    ) -> u64 {
+        let mut counts = 0;
+        if item.kind() != Some(Kind::Triangle) {
+            for lane in places(crossing) {
+                if let Step::On(reach) = self.cross(first + lane, item, distances[lane % LANES]) {
+                    group.reach[lane % LANES] = reach;
+                    counts |= 1 << lane;
+                }
+            }
+            return counts;
+        }
+        let rank = self.view.faces[item.index()].rank();
+        for lane in places(within) {
+            let t = distances[lane % LANES];
+            let hit = &mut self.hits[usize::from(self.members[first + lane])];
+            let leaves = group.leaving[lane % LANES] as u32 == rank;
+            if !leaves && take(hit, item, (t, rank, Part::WHOLE)) {
+                group.reach[lane % LANES] = t;
+                counts |= 1 << lane;
+            }
+        }
+        counts
     }
 
     #[inline(always)]
@@ -348,11 +381,40 @@ impl<K> BlockedOfPacket<'_, K> {
 }
 
 impl<K: BoxKernel> Meeting for BlockedOfPacket<'_, K> {
+    const ENDS: bool = true;
+
     #[inline(always)]
     fn cross(&mut self, place: usize, item: Item, t: f64) -> Step {
         let ray = &self.rays[usize::from(self.members[place])];
         let is_between = is_between(self.view, ray, self.shades.ending_on, item, t);
         self.block(place, item, usize::from(is_between))
+    }
+
+    #[inline(always)]
+    fn cross_group(
+        &mut self,
+        (group, first): (&mut RayGroup, usize),
+        [crossing, within]: [u64; 2],
+        item: Item,
+        distances: &[f64; LANES],
+    ) -> u64 {
+        let mut counts = 0;
+        if item.kind() != Some(Kind::Triangle) || self.shades.has_clear || !self.is_plain(item) {
+            for lane in places(crossing) {
+                let step = self.cross(first + lane, item, distances[lane % LANES]);
+                counts |= u64::from(matches!(step, Step::Enough)) << lane;
+            }
+            return counts;
+        }
+        let rank = self.view.faces[item.index()].rank();
+        for lane in places(within) {
+            let leaves = group.leaving[lane % LANES] as u32 == rank;
+            if !leaves && distances[lane % LANES] < group.reach[lane % LANES] {
+                self.shades.shares[usize::from(self.members[first + lane])] = 0.0;
+                counts |= 1 << lane;
+            }
+        }
+        counts
     }
 
     #[inline(always)]

@@ -6,7 +6,9 @@
 
 use super::{
     box_ray::BoxRay,
-    lanes::{self, Beam, Crossings, FACES, GROUPS, LANES, RayGroup, Turn, larger, smaller},
+    lanes::{
+        self, Beam, Crossings, FACES, Focus, GROUPS, LANES, RayGroup, Sieve, Turn, larger, smaller,
+    },
     parallelepiped::PlaneCrossings,
     ray::{Ray, Shear},
 };
@@ -44,6 +46,12 @@ pub(super) trait BoxKernel: Copy {
         lanes::fill(group, rays, turn);
     }
 
+    /// Finds anew how far boxes may begin, where some rays of a group reach less far than before.
+    #[inline(always)]
+    fn shorten(self, group: &mut RayGroup, turn: &Turn) {
+        lanes::shorten(group, turn);
+    }
+
     /// The beam of all rays of some groups, which go forward on these axes.
     #[inline(always)]
     fn surround(self, groups: &[RayGroup], is_forward: [bool; 3]) -> Beam {
@@ -51,18 +59,42 @@ pub(super) trait BoxKernel: Copy {
     }
 
     /// Which rays of a mask meet the box between three near and three far planes, as
-    /// [`BoxKernel::test`] tells it for each.
+    /// [`BoxKernel::test`] tells it for each. Of rays from `ONE` start the planes are seen from there.
     #[inline(always)]
-    fn enter(self, groups: &[RayGroup; GROUPS], planes: [[f32; 3]; 2], mask: u64) -> u64 {
-        lanes::enter(groups, planes, mask)
+    fn enter<const ONE: bool>(
+        self,
+        groups: &[RayGroup; GROUPS],
+        planes: [[f32; 3]; 2],
+        mask: u64,
+    ) -> u64 {
+        lanes::enter::<ONE>(groups, planes, mask)
     }
 
-    /// The boxes of a node that some ray may meet, a bit each, and where the first one may enter
-    /// them. Rounding keeps order: what a ray computes lies between what the ends of the intervals
-    /// give.
+    /// Where the first ray may enter the boxes of a node, those that some ray may meet, a bit each, and those
+    /// that as good as all meet. Rounding keeps order: what a ray computes lies between what the ends of
+    /// the intervals give.
     #[inline(always)]
-    fn meet_beam(self, node: &Node, beam: &Beam) -> ([f32; 8], u32) {
+    fn meet_beam(self, node: &Node, beam: &Beam) -> ([f32; 8], u32, u32) {
         lanes::meet_beam(node, beam)
+    }
+
+    /// How far the lines of some groups' rays pass by a point, in the order of their axes: the greatest
+    /// distance along the first or the second axis.
+    #[inline(always)]
+    fn spread(self, groups: &[RayGroup], point: &[f64; 3]) -> f64 {
+        lanes::spread(groups, point)
+    }
+
+    /// The sieve of a triangle; its corners are in the order of the rays' axes.
+    #[inline(always)]
+    fn sieve(self, corners: &[[f64; 3]; 3], focus: &Focus) -> Sieve {
+        lanes::sieve(corners, focus)
+    }
+
+    /// The rays of a mask that do not certainly pass by the triangle of a sieve.
+    #[inline(always)]
+    fn sift(self, groups: &[RayGroup; GROUPS], sieve: &Sieve, mask: u64) -> u64 {
+        lanes::sift(groups, sieve, mask)
     }
 
     /// What the rays of a mask are to a triangle; its corners are in the order of the rays' axes.

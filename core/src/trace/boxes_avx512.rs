@@ -2,16 +2,16 @@
 //! of f32.
 
 use std::arch::x86_64::{
-    _CMP_GT_OQ, _CMP_LT_OQ, _mm512_abs_pd, _mm512_add_pd, _mm512_cmp_pd_mask, _mm512_div_pd,
-    _mm512_load_pd, _mm512_max_pd, _mm512_min_pd, _mm512_mul_pd, _mm512_set1_pd, _mm512_setzero_pd,
-    _mm512_storeu_pd, _mm512_sub_pd,
+    _CMP_GT_OQ, _CMP_LE_OQ, _CMP_LT_OQ, _mm512_abs_pd, _mm512_add_pd, _mm512_cmp_pd_mask,
+    _mm512_div_pd, _mm512_load_pd, _mm512_max_pd, _mm512_min_pd, _mm512_mul_pd, _mm512_set1_pd,
+    _mm512_setzero_pd, _mm512_storeu_pd, _mm512_sub_pd,
 };
 
 use super::{
     box_ray::BoxRay,
     boxes::{BoxKernel, KernelWork},
     boxes_x86::Avx2Boxes,
-    lanes::{Beam, Crossings, FACES, GROUPS, LANES, RayGroup, Turn},
+    lanes::{Beam, Crossings, FACES, Focus, GROUPS, LANES, RayGroup, Sieve, Turn},
     ray::{Ray, Shear},
 };
 use crate::prepared::{
@@ -78,18 +78,43 @@ impl BoxKernel for Avx512Boxes {
     }
 
     #[inline(always)]
+    fn shorten(self, group: &mut RayGroup, turn: &Turn) {
+        self.0.shorten(group, turn);
+    }
+
+    #[inline(always)]
     fn surround(self, groups: &[RayGroup], is_forward: [bool; 3]) -> Beam {
         self.0.surround(groups, is_forward)
     }
 
     #[inline(always)]
-    fn enter(self, groups: &[RayGroup; GROUPS], planes: [[f32; 3]; 2], mask: u64) -> u64 {
-        self.0.enter(groups, planes, mask)
+    fn enter<const ONE: bool>(
+        self,
+        groups: &[RayGroup; GROUPS],
+        planes: [[f32; 3]; 2],
+        mask: u64,
+    ) -> u64 {
+        self.0.enter::<ONE>(groups, planes, mask)
     }
 
     #[inline(always)]
-    fn meet_beam(self, node: &Node, beam: &Beam) -> ([f32; 8], u32) {
+    fn meet_beam(self, node: &Node, beam: &Beam) -> ([f32; 8], u32, u32) {
         self.0.meet_beam(node, beam)
+    }
+
+    #[inline(always)]
+    fn spread(self, groups: &[RayGroup], point: &[f64; 3]) -> f64 {
+        self.0.spread(groups, point)
+    }
+
+    #[inline(always)]
+    fn sieve(self, corners: &[[f64; 3]; 3], focus: &Focus) -> Sieve {
+        self.0.sieve(corners, focus)
+    }
+
+    #[inline(always)]
+    fn sift(self, groups: &[RayGroup; GROUPS], sieve: &Sieve, mask: u64) -> u64 {
+        self.0.sift(groups, sieve, mask)
     }
 
     #[inline(always)]
@@ -124,17 +149,18 @@ impl BoxKernel for Avx512Boxes {
             let group = &groups[k];
             // SAFETY: a value of this type says that the CPU has AVX-512. The loads, aligned as the
             // group is, and the store take arrays of exactly 8 numbers.
-            let [possible, certain] = unsafe {
+            let [possible, certain, within] = unsafe {
                 let load = |lanes: &[f64; LANES]| _mm512_load_pd(lanes.as_ptr());
-                let origin =
-                    [load(&group.origin[0]), load(&group.origin[1]), load(&group.origin[2])];
                 let slopes = [load(&group.slopes[0]), load(&group.slopes[1])];
                 let zero = _mm512_setzero_pd();
                 let [mut x, mut y, mut depth] = [[zero; 3]; 3];
                 for (corner, at) in corners.iter().enumerate() {
-                    depth[corner] = _mm512_sub_pd(_mm512_set1_pd(at[2]), origin[2]);
-                    let right = _mm512_sub_pd(_mm512_set1_pd(at[0]), origin[0]);
-                    let up = _mm512_sub_pd(_mm512_set1_pd(at[1]), origin[1]);
+                    let seen = |axis: usize| {
+                        let place = _mm512_set1_pd(at[axis]);
+                        _mm512_sub_pd(place, load(&group.origin[axis]))
+                    };
+                    let (right, up) = (seen(0), seen(1));
+                    depth[corner] = seen(2);
                     x[corner] = _mm512_sub_pd(right, _mm512_mul_pd(slopes[0], depth[corner]));
                     y[corner] = _mm512_sub_pd(up, _mm512_mul_pd(slopes[1], depth[corner]));
                 }
@@ -166,8 +192,12 @@ impl BoxKernel for Avx512Boxes {
                 let t = _mm512_max_pd(_mm512_div_pd(sum, area), nearest);
                 let t = _mm512_min_pd(t, farthest);
                 _mm512_storeu_pd(distances[k].as_mut_ptr(), t);
-                [possible, u64::from(is_plain & is_one_sided) & possible]
+                let certain = u64::from(is_plain & is_one_sided) & possible;
+                let is_ahead = _mm512_cmp_pd_mask::<_CMP_GT_OQ>(t, zero);
+                let is_near = _mm512_cmp_pd_mask::<_CMP_LE_OQ>(t, load(&group.reach));
+                [possible, certain, u64::from(is_ahead & is_near) & certain]
             };
+            crossings.within |= within << (LANES * k);
             crossings.possible |= possible << (LANES * k);
             crossings.certain |= certain << (LANES * k);
         }

@@ -2,25 +2,29 @@
 
 use std::arch::x86_64::{
     __m256, __m256d, _CMP_EQ_OQ, _CMP_GE_OQ, _CMP_GT_OQ, _CMP_LE_OQ, _CMP_LT_OQ, _MM_HINT_T0,
-    _mm_cmple_ps, _mm_cvtss_f32, _mm_loadu_ps, _mm_max_ps, _mm_max_ss, _mm_min_ps, _mm_min_ss,
-    _mm_movehdup_ps, _mm_movehl_ps, _mm_movemask_ps, _mm_mul_ps, _mm_prefetch, _mm_set1_ps,
-    _mm_storeu_ps, _mm_sub_ps, _mm256_add_epi32, _mm256_add_pd, _mm256_and_pd, _mm256_and_si256,
-    _mm256_andnot_pd, _mm256_blendv_pd, _mm256_castpd_ps, _mm256_castpd_si256, _mm256_castps_si256,
+    _mm_add_ps, _mm_andnot_ps, _mm_cmple_ps, _mm_cvtss_f32, _mm_loadu_ps, _mm_max_ps, _mm_max_ss,
+    _mm_min_ps, _mm_min_ss, _mm_movehdup_ps, _mm_movehl_ps, _mm_movemask_ps, _mm_mul_ps,
+    _mm_prefetch, _mm_set1_ps, _mm_setzero_ps, _mm_storeu_ps, _mm_sub_ps, _mm256_add_epi32,
+    _mm256_add_pd, _mm256_add_ps, _mm256_and_pd, _mm256_and_ps, _mm256_and_si256, _mm256_andnot_pd,
+    _mm256_blendv_pd, _mm256_castpd_ps, _mm256_castpd_si256, _mm256_castps_si256,
     _mm256_castps256_ps128, _mm256_castsi256_pd, _mm256_castsi256_ps, _mm256_cmp_pd, _mm256_cmp_ps,
     _mm256_cvtpd_ps, _mm256_cvtps_pd, _mm256_div_pd, _mm256_extractf128_ps, _mm256_load_pd,
     _mm256_load_ps, _mm256_loadu_pd, _mm256_loadu_ps, _mm256_max_pd, _mm256_max_ps, _mm256_min_pd,
     _mm256_min_ps, _mm256_movemask_pd, _mm256_movemask_ps, _mm256_mul_pd, _mm256_mul_ps,
     _mm256_or_pd, _mm256_or_si256, _mm256_permute2f128_pd, _mm256_permute4x64_epi64,
-    _mm256_set_m128, _mm256_set1_epi32, _mm256_set1_epi64x, _mm256_set1_pd, _mm256_set1_ps,
-    _mm256_setr_pd, _mm256_setzero_pd, _mm256_shuffle_ps, _mm256_srai_epi32, _mm256_store_pd,
-    _mm256_store_ps, _mm256_storeu_pd, _mm256_storeu_ps, _mm256_storeu_si256, _mm256_sub_epi32,
-    _mm256_sub_pd, _mm256_sub_ps, _mm256_unpackhi_pd, _mm256_unpacklo_pd,
+    _mm256_permute4x64_pd, _mm256_set_m128, _mm256_set1_epi32, _mm256_set1_epi64x, _mm256_set1_pd,
+    _mm256_set1_ps, _mm256_setr_pd, _mm256_setzero_pd, _mm256_shuffle_ps, _mm256_srai_epi32,
+    _mm256_store_pd, _mm256_store_ps, _mm256_storeu_pd, _mm256_storeu_ps, _mm256_storeu_si256,
+    _mm256_sub_epi32, _mm256_sub_pd, _mm256_sub_ps, _mm256_unpackhi_pd, _mm256_unpacklo_pd,
 };
 
 use super::{
     box_ray::{BoxRay, FAR, NEAR, NEAR_FRAME},
     boxes::{BoxKernel, KernelWork},
-    lanes::{Beam, CLASSES, Crossings, FACES, GROUPS, LANES, LEAST_COMPONENT, RayGroup, Turn},
+    lanes::{
+        Beam, CLASSES, Crossings, FACES, Focus, GROUPS, LANES, LEAST_COMPONENT, RayGroup, SIEVED,
+        Sieve, Turn, bounded,
+    },
     parallelepiped_x86,
     ray::{Ray, Shear},
 };
@@ -224,7 +228,7 @@ impl BoxKernel for Avx2Boxes {
                 _mm256_store_ps(group.far_inverse[axis].as_mut_ptr(), far_inverse);
             }
             let [x, y, z] = turn.axes;
-            let mut reach = [one; 2];
+            let mut slopes = [[one; 2]; 2];
             for (half, numbers) in halves.iter().enumerate() {
                 let store = |lanes: &mut [f64; LANES], numbers| {
                     _mm256_store_pd(lanes.as_mut_ptr().add(4 * half), numbers);
@@ -238,19 +242,32 @@ impl BoxKernel for Avx2Boxes {
                 store(&mut group.origin[0], numbers[x]);
                 store(&mut group.origin[1], numbers[y]);
                 store(&mut group.origin[2], numbers[z]);
-                store(&mut group.slopes[0], _mm256_div_pd(numbers[3 + x], depth));
-                store(&mut group.slopes[1], _mm256_div_pd(numbers[3 + y], depth));
+                for (k, axis) in [x, y].into_iter().enumerate() {
+                    slopes[k][half] = _mm256_div_pd(numbers[3 + axis], depth);
+                    store(&mut group.slopes[k], slopes[k][half]);
+                }
                 store(&mut group.slopes[2], inverses[half][z]);
-                let turn = &turn.reach;
-                let from_start = _mm256_sub_pd(numbers[6], _mm256_set1_pd(turn.start));
-                let scaled = _mm256_mul_pd(from_start, _mm256_set1_pd(turn.scale));
-                let plain = _mm256_add_pd(scaled, _mm256_set1_pd(turn.slack));
-                let size = _mm256_andnot_pd(_mm256_set1_pd(-0.0), plain);
-                let slack = _mm256_mul_pd(size, _mm256_set1_pd(NEAR));
-                reach[half] = _mm256_add_pd(plain, slack);
+                store(&mut group.reach, numbers[6]);
             }
-            let [_, above] = self.rounded_outward(reach[0], reach[1]);
-            _mm256_store_ps(group.high.as_mut_ptr(), above);
+            for (rounded, [low, high]) in group.rounded_slopes.iter_mut().zip(slopes) {
+                let both = _mm256_set_m128(_mm256_cvtpd_ps(high), _mm256_cvtpd_ps(low));
+                _mm256_store_ps(rounded.as_mut_ptr(), both);
+            }
+            let high = self.high(&halves.map(|numbers| numbers[6]), &turn.reach);
+            _mm256_store_ps(group.high.as_mut_ptr(), high);
+        }
+    }
+
+    #[inline(always)]
+    fn shorten(self, group: &mut RayGroup, turn: &Turn) {
+        // SAFETY: a value of this type says that the CPU has AVX2. The loads and the store, aligned as
+        // the group is, take arrays of exactly 8 numbers, those of f64 by halves.
+        unsafe {
+            let reach = group.reach.as_ptr();
+            let reach = [_mm256_load_pd(reach), _mm256_load_pd(reach.add(4))];
+            let before = _mm256_load_ps(group.high.as_ptr());
+            let high = _mm256_min_ps(self.high(&reach, &turn.reach), before);
+            _mm256_store_ps(group.high.as_mut_ptr(), high);
         }
     }
 
@@ -290,7 +307,12 @@ impl BoxKernel for Avx2Boxes {
     }
 
     #[inline(always)]
-    fn enter(self, groups: &[RayGroup; GROUPS], [near, far]: [[f32; 3]; 2], mask: u64) -> u64 {
+    fn enter<const ONE: bool>(
+        self,
+        groups: &[RayGroup; GROUPS],
+        [near, far]: [[f32; 3]; 2],
+        mask: u64,
+    ) -> u64 {
         let mut met = 0;
         // SAFETY: a value of this type says that the CPU has AVX2. The loads read arrays of
         // exactly 8 floats.
@@ -307,8 +329,11 @@ impl BoxKernel for Avx2Boxes {
                 let mut leave = _mm256_load_ps(group.high.as_ptr());
                 for axis in 0..3 {
                     let load = |lanes: &[[f32; LANES]; 3]| _mm256_load_ps(lanes[axis].as_ptr());
-                    let to_near = _mm256_sub_ps(near[axis], load(&group.near_origin));
-                    let to_far = _mm256_sub_ps(far[axis], load(&group.far_origin));
+                    let (mut to_near, mut to_far) = (near[axis], far[axis]);
+                    if !ONE {
+                        to_near = _mm256_sub_ps(to_near, load(&group.near_origin));
+                        to_far = _mm256_sub_ps(to_far, load(&group.far_origin));
+                    }
                     enter = _mm256_max_ps(_mm256_mul_ps(to_near, load(&group.inverse)), enter);
                     let to_far = _mm256_mul_ps(to_far, load(&group.far_inverse));
                     leave = _mm256_min_ps(to_far, leave);
@@ -321,13 +346,14 @@ impl BoxKernel for Avx2Boxes {
     }
 
     #[inline(always)]
-    fn meet_beam(self, node: &Node, beam: &Beam) -> ([f32; 8], u32) {
+    fn meet_beam(self, node: &Node, beam: &Beam) -> ([f32; 8], u32, u32) {
         let mut distances = [0.0; 8];
         // SAFETY: a value of this type says that the CPU has AVX2. The loads read `planes[_]` and
         // the store writes `distances`, exactly 8 floats each.
-        let mask = unsafe {
+        let [mask, within] = unsafe {
             let mut enter = _mm256_set1_ps(-0.0);
             let mut leave = _mm256_set1_ps(beam.high);
+            let (mut all_enter, mut first_leaves) = (enter, leave);
             for axis in 0..3 {
                 let near = _mm256_loadu_ps(node.planes[beam.near[axis]].as_ptr());
                 let far = _mm256_loadu_ps(node.planes[beam.far[axis]].as_ptr());
@@ -337,15 +363,18 @@ impl BoxKernel for Avx2Boxes {
                 let a = _mm256_mul_ps(near, _mm256_set1_ps(a));
                 let b = _mm256_mul_ps(near, _mm256_set1_ps(b));
                 enter = _mm256_max_ps(_mm256_min_ps(a, b), enter);
+                all_enter = _mm256_max_ps(_mm256_max_ps(a, b), all_enter);
                 let [a, b] = beam.far_inverse[axis];
                 let a = _mm256_mul_ps(far, _mm256_set1_ps(a));
                 let b = _mm256_mul_ps(far, _mm256_set1_ps(b));
                 leave = _mm256_min_ps(_mm256_max_ps(a, b), leave);
+                first_leaves = _mm256_min_ps(_mm256_min_ps(a, b), first_leaves);
             }
             _mm256_storeu_ps(distances.as_mut_ptr(), enter);
-            _mm256_movemask_ps(_mm256_cmp_ps::<_CMP_LE_OQ>(enter, leave)) as u32
+            let not_after = |a, b| _mm256_movemask_ps(_mm256_cmp_ps::<_CMP_LE_OQ>(a, b)) as u32;
+            [not_after(enter, leave), not_after(all_enter, first_leaves)]
         };
-        (distances, mask)
+        (distances, mask, within)
     }
 
     #[inline(always)]
@@ -366,27 +395,141 @@ impl BoxKernel for Avx2Boxes {
             let (group, first) = (&groups[half / 2], 4 * (half % 2));
             // SAFETY: a value of this type says that the CPU has AVX2. The loads and the store
             // take 4 of 8 numbers, from the first or from the fifth on.
-            let [possible, certain] = unsafe {
+            let [possible, certain, within] = unsafe {
                 let load = |lanes: &[f64; LANES]| _mm256_load_pd(lanes.as_ptr().add(first));
-                let origin = [&group.origin[0], &group.origin[1], &group.origin[2]];
                 let slopes = [&group.slopes[0], &group.slopes[1], &group.slopes[2]];
                 let zero = _mm256_setzero_pd();
                 let [mut x, mut y, mut z] = [[zero; 3]; 3];
                 for (corner, at) in corners.iter().enumerate() {
-                    let depth = _mm256_sub_pd(_mm256_set1_pd(at[2]), load(origin[2]));
-                    let right = _mm256_sub_pd(_mm256_set1_pd(at[0]), load(origin[0]));
-                    let up = _mm256_sub_pd(_mm256_set1_pd(at[1]), load(origin[1]));
+                    let seen = |axis: usize| {
+                        let place = _mm256_set1_pd(at[axis]);
+                        _mm256_sub_pd(place, load(&group.origin[axis]))
+                    };
+                    let (right, up, depth) = (seen(0), seen(1), seen(2));
                     x[corner] = _mm256_sub_pd(right, _mm256_mul_pd(load(slopes[0]), depth));
                     y[corner] = _mm256_sub_pd(up, _mm256_mul_pd(load(slopes[1]), depth));
                     z[corner] = _mm256_mul_pd(load(slopes[2]), depth);
                 }
                 let four = &mut distances.as_flattened_mut().as_chunks_mut().0[half];
-                self.cross_seen([x, y, z], asking, four)
+                let [possible, certain] = self.cross_seen([x, y, z], asking, four);
+                let mut within = certain;
+                if certain != 0 {
+                    let t = _mm256_loadu_pd(four.as_ptr());
+                    let is_ahead = _mm256_cmp_pd::<_CMP_GT_OQ>(t, zero);
+                    let is_near = _mm256_cmp_pd::<_CMP_LE_OQ>(t, load(&group.reach));
+                    within &= _mm256_movemask_pd(_mm256_and_pd(is_ahead, is_near)) as u64;
+                }
+                [possible, certain, within]
             };
+            crossings.within |= within << (4 * half);
             crossings.possible |= possible << (4 * half);
             crossings.certain |= certain << (4 * half);
         }
         crossings
+    }
+
+    #[inline(always)]
+    fn spread(self, groups: &[RayGroup], point: &[f64; 3]) -> f64 {
+        let mut spread = [0.0; 4];
+        // SAFETY: a value of this type says that the CPU has AVX2. The loads, aligned as the groups are,
+        // take 4 of 8 numbers, from the first or from the fifth on; the store takes an array of exactly 4.
+        unsafe {
+            let sign = _mm256_set1_pd(-0.0);
+            let mut greatest = _mm256_setzero_pd();
+            for group in groups {
+                for half in [0, 4] {
+                    let load = |lanes: &[f64; LANES]| _mm256_load_pd(lanes.as_ptr().add(half));
+                    let seen = |axis: usize| {
+                        _mm256_sub_pd(_mm256_set1_pd(point[axis]), load(&group.origin[axis]))
+                    };
+                    let depth = seen(2);
+                    for axis in 0..2 {
+                        let slope = _mm256_mul_pd(load(&group.slopes[axis]), depth);
+                        let place = _mm256_sub_pd(seen(axis), slope);
+                        greatest = _mm256_max_pd(_mm256_andnot_pd(sign, place), greatest);
+                    }
+                }
+            }
+            _mm256_storeu_pd(spread.as_mut_ptr(), greatest);
+        }
+        let [a, b, c, d] = spread;
+        a.max(b).max(c.max(d))
+    }
+
+    #[inline(always)]
+    fn sieve(self, corners: &[[f64; 3]; 3], focus: &Focus) -> Sieve {
+        let mut sieve = Sieve { factors: [[0.0; 4]; 3], bound: 0.0 };
+        let mut bounds = [0.0; 4];
+        // SAFETY: a value of this type says that the CPU has AVX2. The stores take arrays of exactly 4
+        // numbers.
+        unsafe {
+            let [a, b, c] = corners;
+            let zero = _mm256_setzero_pd();
+            let [mut from, mut to] = [[zero; 3]; 2];
+            for axis in 0..3 {
+                let places = _mm256_setr_pd(a[axis], b[axis], c[axis], a[axis]);
+                from[axis] = _mm256_sub_pd(places, _mm256_set1_pd(focus.point[axis]));
+                // The next corner: the second, the third, the first, the second.
+                to[axis] = _mm256_permute4x64_pd::<0b01_00_10_01>(from[axis]);
+            }
+            let sign = _mm256_set1_pd(-0.0);
+            let mut sizes = _mm_setzero_ps();
+            let mut length = zero;
+            for axis in 0..3 {
+                let (next, last) = ((axis + 1) % 3, (axis + 2) % 3);
+                let factor = _mm256_sub_pd(
+                    _mm256_mul_pd(from[next], to[last]),
+                    _mm256_mul_pd(from[last], to[next]),
+                );
+                let factor = _mm256_cvtpd_ps(factor);
+                _mm_storeu_ps(sieve.factors[axis].as_mut_ptr(), factor);
+                sizes = _mm_add_ps(sizes, _mm_andnot_ps(_mm_set1_ps(-0.0), factor));
+                let step = _mm256_sub_pd(to[axis], from[axis]);
+                length = _mm256_add_pd(length, _mm256_andnot_pd(sign, step));
+            }
+            let sizes = _mm256_mul_pd(_mm256_cvtps_pd(sizes), _mm256_set1_pd(SIEVED));
+            let length = _mm256_mul_pd(length, _mm256_set1_pd(2.0 * focus.spread));
+            _mm256_storeu_pd(bounds.as_mut_ptr(), _mm256_add_pd(sizes, length));
+        }
+        let [a, b, c, _] = bounds;
+        sieve.bound = bounded(a.max(b).max(c), focus);
+        sieve
+    }
+
+    #[inline(always)]
+    fn sift(self, groups: &[RayGroup; GROUPS], sieve: &Sieve, mask: u64) -> u64 {
+        let mut possible = 0;
+        // SAFETY: a value of this type says that the CPU has AVX2. The loads, aligned as the groups are, read
+        // arrays of exactly 8 floats.
+        unsafe {
+            let splat = |factors: &[f32; 4]| {
+                [_mm256_set1_ps(factors[0]), _mm256_set1_ps(factors[1]), _mm256_set1_ps(factors[2])]
+            };
+            let [first, second, last] =
+                [splat(&sieve.factors[0]), splat(&sieve.factors[1]), splat(&sieve.factors[2])];
+            let (below, above) = (_mm256_set1_ps(-sieve.bound), _mm256_set1_ps(sieve.bound));
+            let mut left = mask;
+            while left != 0 {
+                let k = left.trailing_zeros() as usize / LANES % GROUPS;
+                let asking = left >> (LANES * k) & 0xFF;
+                left &= !(0xFF << (LANES * k));
+                let [right, up] = &groups[k].rounded_slopes;
+                let right = _mm256_load_ps(right.as_ptr());
+                let up = _mm256_load_ps(up.as_ptr());
+                let area = |edge: usize| {
+                    let nearly = _mm256_add_ps(last[edge], _mm256_mul_ps(right, first[edge]));
+                    _mm256_add_ps(nearly, _mm256_mul_ps(up, second[edge]))
+                };
+                let areas = [area(0), area(1), area(2)];
+                let least = _mm256_min_ps(areas[0], _mm256_min_ps(areas[1], areas[2]));
+                let most = _mm256_max_ps(areas[0], _mm256_max_ps(areas[1], areas[2]));
+                let is_below = _mm256_cmp_ps::<_CMP_LT_OQ>(least, below);
+                let is_above = _mm256_cmp_ps::<_CMP_GT_OQ>(most, above);
+                let past = _mm256_movemask_ps(_mm256_and_ps(is_below, is_above)) as u64;
+                possible |= (asking & !past) << (LANES * k);
+            }
+        }
+        possible
     }
 
     #[inline(always)]
@@ -420,7 +563,7 @@ impl BoxKernel for Avx2Boxes {
             }
             self.cross_seen([x, y, z], 0xF, distances)
         };
-        Crossings { possible, certain }
+        Crossings { possible, certain, within: 0 }
     }
 
     #[inline(always)]
@@ -500,6 +643,24 @@ impl Avx2Boxes {
                 numbers[half + 3] = _mm256_permute2f128_pd::<0x31>(odd, later_odd);
             }
             numbers
+        }
+    }
+
+    /// `BoxRay::reach` of a ray that ends at each of these distances, in two halves.
+    #[inline(always)]
+    fn high(self, reach: &[__m256d; 2], ray: &BoxRay) -> __m256 {
+        // SAFETY: a value of this type says that the CPU has AVX2.
+        unsafe {
+            let mut high = [_mm256_setzero_pd(); 2];
+            for (high, &reach) in high.iter_mut().zip(reach) {
+                let from_start = _mm256_sub_pd(reach, _mm256_set1_pd(ray.start));
+                let scaled = _mm256_mul_pd(from_start, _mm256_set1_pd(ray.scale));
+                let plain = _mm256_add_pd(scaled, _mm256_set1_pd(ray.slack));
+                let size = _mm256_andnot_pd(_mm256_set1_pd(-0.0), plain);
+                *high = _mm256_add_pd(plain, _mm256_mul_pd(size, _mm256_set1_pd(NEAR)));
+            }
+            let [_, above] = self.rounded_outward(high[0], high[1]);
+            above
         }
     }
 

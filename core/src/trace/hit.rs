@@ -55,7 +55,7 @@ impl<'a> Nearest<'a> {
 
 /// Takes in where a ray meets an item; whether that is its nearest hit until now.
 #[inline(always)]
-fn take(hit: &mut Hit, item: Item, (t, rank, part): (f64, u32, Part)) -> bool {
+pub(super) fn take(hit: &mut Hit, item: Item, (t, rank, part): (f64, u32, Part)) -> bool {
     let is_nearest = t < hit.t || (t == hit.t && rank < hit.rank && hit.is_some());
     if is_nearest {
         *hit = Hit { t, rank, face: Face { item, part } };

@@ -57,7 +57,7 @@ mod tests {
         trace::{
             box_ray::BoxRay,
             boxes::BoxKernel,
-            lanes::{CLASSES, Crossings, FACES, LANES, MOST_RAYS, RayGroup, class_of},
+            lanes::{CLASSES, Crossings, FACES, LANES, MOST_RAYS, RayGroup, Sieve, class_of},
             packet::Packet,
             ray::{Ray, Shear},
             triangle::hit_triangle,
@@ -161,8 +161,12 @@ mod tests {
             let frame = Frame { origin: [0.0; 3], scale: 1.0 };
             let mut point = || DVec3::from_array([(); 3].map(|()| grid_or_any(random)));
             let eye = point();
-            let corners = [point(), point(), point()];
+            let (a, b, c) = (point(), point(), point());
+            let size = [1.0, 1e-2, 1e-5][random.below(3)];
+            let corners = [a, a + size * (b - a), a + size * (c - a)];
             let mut rays = Vec::new();
+            // From one place, from several, or towards one place.
+            let kind = random.below(3);
             for _ in 0..MOST_RAYS {
                 let [a, b, c] = corners;
                 let target = match random.below(4) {
@@ -170,10 +174,19 @@ mod tests {
                     1 => a + random.unit() * (b - a),
                     _ => a + random.unit() * (b - a) + random.unit() * (c - a),
                 };
-                let origin = if random.chance(0.7) { eye } else { eye + 0.1 * random.in_cube() };
-                let reach = [f64::INFINITY, 0.5, 3.0][random.below(3)];
+                let origin = match kind {
+                    0 => eye,
+                    1 if random.chance(0.7) => eye,
+                    1 => eye + 0.1 * random.in_cube(),
+                    _ => target + random.between(-0.5, 1.0) * (target - eye),
+                };
+                let reach = match kind {
+                    2 => (eye - origin).length(),
+                    _ => [f64::INFINITY, 0.5, 3.0][random.below(3)],
+                };
                 let (leaving, after) = (Surface::NONE, Ray::NOTHING_AHEAD);
-                let direction = (target - origin).normalize();
+                let aim = if kind == 2 { eye } else { target };
+                let direction = (aim - origin).normalize();
                 let direction = if direction.is_finite() { direction } else { DVec3::Y };
                 rays.push(Ray { origin, direction, reach, leaving, after });
             }
@@ -204,9 +217,13 @@ mod tests {
     struct FoundByGroup {
         entering: [u64; 8],
         met: u32,
+        within: u32,
         nears: [u32; 8],
         crossings: Crossings,
         distances: Vec<Option<u64>>,
+        /// How far the lines pass by the packet's focus, the triangle's sieve and the rays that it lets through.
+        sifted: Option<(u64, Sieve, u64)>,
+        shortened: String,
         classes: Vec<u64>,
         filled: Option<String>,
         beam: String,
@@ -217,14 +234,27 @@ mod tests {
             let Group { packet, corners, node, mask, .. } = group;
             let mut entering = [0; 8];
             for (child, entering) in entering.iter_mut().enumerate() {
-                *entering = kernel.enter(&packet.groups, group.planes(child), *mask);
+                *entering = kernel.enter::<false>(&packet.groups, group.planes(child), *mask);
+                assert_eq!(packet.enter(kernel, node, child, *mask), *entering);
             }
-            let (nears, met) = kernel.meet_beam(node, &packet.beam);
+            let count = group.rays.len().div_ceil(LANES);
+            let (nears, met, within) = kernel.meet_beam(node, &packet.beam);
             let mut distances = packet.crossings;
             let crossings = kernel.cross(&packet.groups, corners, *mask, &mut distances);
             let distances = (distances.as_flattened().iter().enumerate())
                 .map(|(k, t)| (crossings.certain >> k & 1 == 1).then_some(t.to_bits()))
                 .collect();
+            let sifted = packet.focus.map(|focus| {
+                let spread = kernel.spread(&packet.groups[..count], &focus.point);
+                let sieve = kernel.sieve(corners, &focus);
+                (spread.to_bits(), sieve, kernel.sift(&packet.groups, &sieve, *mask))
+            });
+            let mut shortened = packet.groups[0];
+            for (reach, t) in shortened.reach.iter_mut().zip(packet.groups[0].slopes[0]) {
+                *reach = if t > 0.0 { t } else { *reach };
+            }
+            kernel.shorten(&mut shortened, &packet.turn);
+            let shortened = format!("{:?}", shortened.high);
             let nears = nears.map(f32::to_bits);
             let classes = group.all.as_chunks().0.iter();
             let classes =
@@ -234,15 +264,17 @@ mod tests {
                 kernel.fill(&mut filled, rays.each_ref(), &packet.turn);
                 format!("{filled:?}")
             });
-            let count = group.rays.len().div_ceil(LANES);
             let beam = kernel.surround(&packet.groups[..count], packet.turn.is_forward);
             let beam = format!("{beam:?}");
             *self = Some(FoundByGroup {
                 entering,
                 met,
+                within,
                 nears,
                 crossings,
                 distances,
+                sifted,
+                shortened,
                 classes,
                 filled,
                 beam,
@@ -253,7 +285,7 @@ mod tests {
     #[test]
     fn rays_of_a_group_meet_what_each_meets_alone() {
         let random = &mut Random::new(18);
-        let (mut entered, mut crossed, mut doubted) = (0, 0, 0);
+        let [mut entered, mut crossed, mut doubted, mut held_back] = [0; 4];
         for _ in 0..2_000 {
             let group = Group::random(random);
             let find = |isa| {
@@ -288,8 +320,15 @@ mod tests {
                 let is = |mask: u64| mask >> k & 1 == 1;
                 if is(found.crossings.certain) {
                     assert_eq!(found.distances[k], t, "{ray:?}");
+                    let is_within =
+                        t.map(f64::from_bits).is_some_and(|t| t > 0.0 && t <= ray.reach);
+                    assert_eq!(is(found.crossings.within), is_within, "{ray:?}");
                 }
                 assert!(is(found.crossings.possible) || t.is_none(), "{ray:?}");
+                if let Some((_, _, sifted)) = found.sifted {
+                    assert!(is(sifted) || t.is_none(), "{ray:?}");
+                    held_back += u32::from(!is(sifted));
+                }
                 crossed += u32::from(is(found.crossings.certain));
                 doubted += u32::from(is(found.crossings.possible & !found.crossings.certain));
             }
@@ -298,6 +337,7 @@ mod tests {
             entered > 1_000 && crossed > 1_000 && doubted > 1_000,
             "{entered} boxes are entered, {crossed} triangles crossed, {doubted} in doubt"
         );
+        assert!(held_back > 1_000, "{held_back} rays that pass by are held back");
     }
 
     /// A ray and four triangles.

@@ -35,10 +35,14 @@ pub(super) struct RayGroup {
     /// In the order of the axes of the rays' [`Shear`].
     pub(super) origin: [[f64; LANES]; 3],
     pub(super) slopes: [[f64; LANES]; 3],
+    /// The first two, rounded.
+    pub(super) rounded_slopes: [[f32; LANES]; 2],
     /// In the order x, y, z.
     pub(super) direction: [[f64; LANES]; 3],
     /// The surface that a ray leaves in the lower half, what it went through in the upper half.
     pub(super) leaving: [u64; LANES],
+    /// Only what is met nearer than this counts.
+    pub(super) reach: [f64; LANES],
     pub(super) near_origin: [[f32; LANES]; 3],
     pub(super) far_origin: [[f32; LANES]; 3],
     pub(super) inverse: [[f32; LANES]; 3],
@@ -50,8 +54,10 @@ impl RayGroup {
     pub(super) const EMPTY: Self = Self {
         origin: [[0.0; LANES]; 3],
         slopes: [[0.0; LANES]; 3],
+        rounded_slopes: [[0.0; LANES]; 2],
         direction: [[0.0; LANES]; 3],
         leaving: [0; LANES],
+        reach: [0.0; LANES],
         near_origin: [[0.0; LANES]; 3],
         far_origin: [[0.0; LANES]; 3],
         inverse: [[0.0; LANES]; 3],
@@ -129,6 +135,47 @@ impl Beam {
     }
 }
 
+/// A point that the lines of all rays of a packet pass, near enough to tell from it which of them certainly
+/// pass by a triangle: where camera rays start, or where shadow rays end.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Focus {
+    /// In the order of the axes of the rays' [`Shear`].
+    pub(super) point: [f64; 3],
+    /// How far lines pass by it, at its depth, along the first or the second axis.
+    pub(super) spread: f64,
+    /// What f64 rounding may take from twice an area.
+    pub(super) blur: f64,
+}
+
+impl Focus {
+    /// A point for rays near the frame, with the axes of their [`Shear`]; `spread` is as
+    /// `BoxKernel::spread` finds it.
+    pub(super) fn new(point: [f64; 3], spread: f64, frame: &Frame, axes: [usize; 3]) -> Self {
+        let mut most = (NEAR_FRAME + 2.0) / frame.scale;
+        for (at, axis) in point.into_iter().zip(axes) {
+            most += (at - frame.origin[axis]).abs();
+        }
+        Self { point, spread, blur: most * most * BLUR }
+    }
+}
+
+/// See `docs/proof.md`, boxes.
+const BLUR: f64 = 1.0 / (1_u64 << 44) as f64;
+
+/// What decides in f32 whether rays certainly pass by a triangle: twice the areas of (ray, a, b), (ray, b, c)
+/// and (ray, c, a) as a ray through the focus sees them are linear in its slopes.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Sieve {
+    /// The factors of the first slope, of the second one and of 1, for each edge; the last edge is the
+    /// first once more.
+    pub(super) factors: [[f32; 4]; 3],
+    /// An area that is further than this from 0 has the sign that `edge` finds.
+    pub(super) bound: f32,
+}
+
+/// What f32 rounding takes from twice an area, as a part of its factors: see `docs/proof.md`, boxes.
+pub(super) const SIEVED: f64 = 8.0 / (1_u64 << 24) as f64;
+
 /// What rays are to a triangle, a bit each.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub(super) struct Crossings {
@@ -136,6 +183,9 @@ pub(super) struct Crossings {
     pub(super) possible: u64,
     /// They cross it for certain, and their distances are known.
     pub(super) certain: u64,
+    /// They do so in front of their starts and within their reach. Of one ray before several triangles
+    /// this is not asked.
+    pub(super) within: u64,
 }
 
 /// The smaller number as the SIMD instructions have it: of a NaN and a number, the second operand.
@@ -201,7 +251,19 @@ pub(super) fn fill(group: &mut RayGroup, rays: [&Ray; LANES], turn: &Turn) {
         group.slopes[0][lane] = x / z;
         group.slopes[1][lane] = y / z;
         group.slopes[2][lane] = 1.0 / z;
+        for (rounded, slope) in group.rounded_slopes.iter_mut().zip([x / z, y / z]) {
+            rounded[lane] = slope as f32;
+        }
+        group.reach[lane] = ray.reach;
         group.high[lane] = turn.reach.reach(ray.reach);
+    }
+}
+
+/// `BoxKernel::shorten` in plain Rust.
+#[inline(always)]
+pub(super) fn shorten(group: &mut RayGroup, turn: &Turn) {
+    for (high, &reach) in group.high.iter_mut().zip(&group.reach) {
+        *high = smaller(turn.reach.reach(reach), *high);
     }
 }
 
@@ -241,15 +303,22 @@ pub(super) fn surround(groups: &[RayGroup], is_forward: [bool; 3]) -> Beam {
 
 /// `BoxKernel::enter` in plain Rust.
 #[inline(always)]
-pub(super) fn enter(groups: &[RayGroup; GROUPS], [near, far]: [[f32; 3]; 2], mask: u64) -> u64 {
+pub(super) fn enter<const ONE: bool>(
+    groups: &[RayGroup; GROUPS],
+    [near, far]: [[f32; 3]; 2],
+    mask: u64,
+) -> u64 {
     by_groups(mask, |group| {
         let group = &groups[group];
         let mut met = 0;
         for lane in 0..LANES {
             let (mut enter, mut leave) = (-0.0, group.high[lane]);
             for axis in 0..3 {
-                let to_near = near[axis] - group.near_origin[axis][lane];
-                let to_far = far[axis] - group.far_origin[axis][lane];
+                let (mut to_near, mut to_far) = (near[axis], far[axis]);
+                if !ONE {
+                    to_near -= group.near_origin[axis][lane];
+                    to_far -= group.far_origin[axis][lane];
+                }
                 enter = larger(to_near * group.inverse[axis][lane], enter);
                 leave = smaller(to_far * group.far_inverse[axis][lane], leave);
             }
@@ -259,24 +328,91 @@ pub(super) fn enter(groups: &[RayGroup; GROUPS], [near, far]: [[f32; 3]; 2], mas
     })
 }
 
+/// `BoxKernel::spread` in plain Rust.
+#[inline(always)]
+pub(super) fn spread(groups: &[RayGroup], point: &[f64; 3]) -> f64 {
+    let mut spread: f64 = 0.0;
+    for group in groups {
+        for lane in 0..LANES {
+            let seen = shear_at(group, lane, [0, 1, 2]).project(point);
+            spread = spread.max(seen.x.abs()).max(seen.y.abs());
+        }
+    }
+    spread
+}
+
+/// `BoxKernel::sieve` in plain Rust.
+#[inline(always)]
+pub(super) fn sieve(corners: &[[f64; 3]; 3], focus: &Focus) -> Sieve {
+    let mut seen = [[0.0; 3]; 3];
+    for (seen, corner) in seen.iter_mut().zip(corners) {
+        for axis in 0..3 {
+            seen[axis] = corner[axis] - focus.point[axis];
+        }
+    }
+    let mut sieve = Sieve { factors: [[0.0; 4]; 3], bound: 0.0 };
+    let mut bound: f64 = 0.0;
+    for edge in 0..4 {
+        let ([ax, ay, az], [bx, by, bz]) = (seen[edge % 3], seen[(edge + 1) % 3]);
+        let factors = [ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx];
+        for (factors, factor) in sieve.factors.iter_mut().zip(factors) {
+            factors[edge] = factor as f32;
+        }
+        let [x, y, z] = sieve.factors.map(|factors| factors[edge].abs());
+        let length = (bx - ax).abs() + (by - ay).abs() + (bz - az).abs();
+        bound = bound.max(f64::from(x + y + z) * SIEVED + length * (2.0 * focus.spread));
+    }
+    sieve.bound = bounded(bound, focus);
+    sieve
+}
+
+/// The bound of a [`Sieve`] from what its edges have.
+#[inline(always)]
+pub(super) fn bounded(of_edges: f64, focus: &Focus) -> f32 {
+    ((of_edges + focus.blur) * 1.001) as f32 + f32::MIN_POSITIVE
+}
+
+/// `BoxKernel::sift` in plain Rust.
+#[inline(always)]
+pub(super) fn sift(groups: &[RayGroup; GROUPS], sieve: &Sieve, mask: u64) -> u64 {
+    let Sieve { factors: [first, second, last], bound } = sieve;
+    by_groups(mask, |k| {
+        let [right, up] = &groups[k].rounded_slopes;
+        let mut possible = 0;
+        for lane in 0..LANES {
+            let area =
+                |edge: usize| (last[edge] + right[lane] * first[edge]) + up[lane] * second[edge];
+            let areas = [area(0), area(1), area(2)];
+            let is_past =
+                areas.iter().any(|area| *area < -bound) && areas.iter().any(|area| area > bound);
+            possible |= u64::from(!is_past) << lane;
+        }
+        possible
+    })
+}
+
 /// `BoxKernel::meet_beam` in plain Rust.
 #[inline(always)]
-pub(super) fn meet_beam(node: &Node, beam: &Beam) -> ([f32; 8], u32) {
+pub(super) fn meet_beam(node: &Node, beam: &Beam) -> ([f32; 8], u32, u32) {
     let mut distances = [-0.0; 8];
-    let mut mask = 0;
+    let (mut mask, mut within) = (0, 0);
     for (child, enter) in distances.iter_mut().enumerate() {
         let mut leave = beam.high;
+        let (mut all_enter, mut first_leaves) = (-0.0, leave);
         for axis in 0..3 {
             let near = node.planes[beam.near[axis]][child] - beam.near_origin[axis];
             let far = node.planes[beam.far[axis]][child] - beam.far_origin[axis];
             let [a, b] = beam.inverse[axis];
             *enter = larger(smaller(near * a, near * b), *enter);
+            all_enter = larger(larger(near * a, near * b), all_enter);
             let [a, b] = beam.far_inverse[axis];
             leave = smaller(larger(far * a, far * b), leave);
+            first_leaves = smaller(smaller(far * a, far * b), first_leaves);
         }
         mask |= u32::from(*enter <= leave) << child;
+        within |= u32::from(all_enter <= first_leaves) << child;
     }
-    (distances, mask)
+    (distances, mask, within)
 }
 
 /// `BoxKernel::cross` in plain Rust.
@@ -287,7 +423,7 @@ pub(super) fn cross(
     mask: u64,
     distances: &mut [[f64; LANES]; GROUPS],
 ) -> Crossings {
-    let mut certain = 0;
+    let (mut certain, mut within) = (0, 0);
     let possible = by_groups(mask, |k| {
         let group = &groups[k];
         let mut possible = 0;
@@ -296,10 +432,12 @@ pub(super) fn cross(
             let crossing = cross_seen(&shear.project_all(corners), distance);
             possible |= crossing.possible << lane;
             certain |= crossing.certain << (LANES * k + lane);
+            let is_within = *distance > 0.0 && *distance <= group.reach[lane];
+            within |= (crossing.certain & u64::from(is_within)) << (LANES * k + lane);
         }
         possible
     });
-    Crossings { possible, certain: certain & mask }
+    Crossings { possible, certain: certain & mask, within: within & mask }
 }
 
 /// `BoxKernel::cross_four` in plain Rust.
@@ -330,12 +468,12 @@ fn cross_seen([a, b, c]: &[Projected; 3], distance: &mut f64) -> Crossings {
     let extent = [a, b, c].iter().map(|p| p.x.abs().max(p.y.abs())).fold(0.0, f64::max);
     let area = over[0] + over[1] + over[2];
     if over.contains(&0.0) || area.abs() <= extent * extent / 8.0 {
-        return Crossings { possible: 1, certain: 0 };
+        return Crossings { possible: 1, ..Crossings::default() };
     }
     let t = (over[0] * a.z + over[1] * b.z + over[2] * c.z) / area;
     let (least, most) = (a.z.min(b.z).min(c.z), a.z.max(b.z).max(c.z));
     *distance = t.max(least).min(most);
-    Crossings { possible: 1, certain: 1 }
+    Crossings { possible: 1, certain: 1, within: 0 }
 }
 
 /// What a lane holds, as a [`Shear`] with these axes.

@@ -1,12 +1,32 @@
 //! What rays that are under way tell of what they meet.
 
-use super::{box_ray::BoxRay, ray::Shear, traversal::Step};
+use super::{
+    box_ray::BoxRay,
+    lanes::{LANES, RayGroup},
+    ray::Shear,
+    traversal::Step,
+};
 use crate::prepared::record::Item;
 
 /// What is done with what rays meet. A ray is told by its place among those that are under way.
 pub(super) trait Meeting {
+    /// Whether a ray's answer is known as soon as it has met something that counts; else it then only
+    /// reaches less far.
+    const ENDS: bool;
+
     /// The ray at a place in the packet crosses a triangle at a distance, before or behind its start.
     fn cross(&mut self, place: usize, item: Item, t: f64) -> Step;
+
+    /// The same for rays of a group whose first one is at a place, by a mask of its lanes, and by one of those
+    /// among them that do so in front of their starts and within their reach; which of them have met something
+    /// that counts. Where rays reach less far then, the group knows.
+    fn cross_group(
+        &mut self,
+        group: (&mut RayGroup, usize),
+        crossing: [u64; 2],
+        item: Item,
+        distances: &[f64; LANES],
+    ) -> u64;
 
     /// Whether each ray meets this sphere or quadrangle as [`Meeting::cross_sphere`] and
     /// [`Meeting::cross_quadrangle`] have it; else it is asked.

@@ -13,7 +13,7 @@ use super::{
     box_ray::BoxRay,
     boxes::BoxKernel,
     lane_faces::{cross_plane, cross_sphere, cross_sphere_again, leaves, pass_quadrangle},
-    lanes::{Beam, GROUPS, LANES, MOST_RAYS, RayGroup, Turn, larger, shear_at},
+    lanes::{Beam, Focus, GROUPS, LANES, MOST_RAYS, RayGroup, Turn, larger, shear_at},
     lone::step,
     meeting::Meeting,
     ray::{Ray, Shear},
@@ -28,6 +28,12 @@ use crate::prepared::{
 /// So many rays, or fewer, go on alone.
 const FEW: u32 = 2;
 
+/// So many rays, or fewer, are not sifted before they are tried on a triangle.
+const FEW_TO_SIFT: u32 = 8;
+
+/// Lines that pass by a point by no more than this part of the frame have it as a focus.
+const MOST_SPREAD: f64 = 1.0 / (1_u64 << 20) as f64;
+
 /// Up to [`MOST_RAYS`] rays of one class.
 #[derive(Debug)]
 pub(super) struct Packet {
@@ -38,6 +44,12 @@ pub(super) struct Packet {
     pub(super) turn: Turn,
     /// The rays that still look for something, a bit each.
     pub(super) alive: u64,
+    /// Whether all rays start at one place.
+    has_one_start: bool,
+    /// What sieves are made from, if rays have it.
+    pub(super) focus: Option<Focus>,
+    /// The groups with rays that reach less far than boxes know, a bit each.
+    shortened: u64,
 }
 
 /// Room for children that wait, each with where it begins and the rays that enter it, and for a node.
@@ -64,6 +76,9 @@ impl Default for Packet {
                 axes: [0; 3],
             },
             alive: 0,
+            has_one_start: false,
+            focus: None,
+            shortened: 0,
         }
     }
 }
@@ -90,7 +105,39 @@ impl Packet {
             }
             kernel.fill(group, of_lanes, &self.turn);
         }
+        let groups = &self.groups[..count];
+        self.has_one_start = start_together(groups);
+        // Where rays start at one place that is their focus, or else where the first of them ends.
+        let Ray { origin, direction, reach, .. } = &rays[usize::from(members[0])];
+        let place = if self.has_one_start { *origin } else { *origin + *reach * *direction };
+        let [x, y, z] = self.turn.axes;
+        let place = [place[x], place[y], place[z]];
+        let spread =
+            if place[0].is_finite() { kernel.spread(groups, &place) } else { f64::INFINITY };
+        self.focus = (spread * frame.scale < MOST_SPREAD)
+            .then(|| Focus::new(place, spread, frame, self.turn.axes));
         self.beam = kernel.surround(&self.groups[..count], self.turn.is_forward);
+    }
+
+    /// Which rays of a mask meet the child of a node at this place.
+    #[inline(always)]
+    pub(super) fn enter(
+        &self,
+        kernel: impl BoxKernel,
+        node: &Node,
+        child: usize,
+        mask: u64,
+    ) -> u64 {
+        let planes = |sides: [usize; 3]| sides.map(|side| node.planes[side][child]);
+        let [mut near, mut far] = [planes(self.beam.near), planes(self.beam.far)];
+        if !self.has_one_start {
+            return kernel.enter::<false>(&self.groups, [near, far], mask);
+        }
+        for axis in 0..3 {
+            near[axis] -= self.beam.near_origin[axis];
+            far[axis] -= self.beam.far_origin[axis];
+        }
+        kernel.enter::<true>(&self.groups, [near, far], mask)
     }
 
     /// A ray as boxes want it.
@@ -121,7 +168,8 @@ impl Packet {
         match *step {
             Step::Past => return false,
             Step::On(reach) => {
-                self.groups[place / LANES].high[place % LANES] = self.turn.reach.reach(reach);
+                self.groups[place / LANES].reach[place % LANES] = reach;
+                self.shortened |= 1 << (place / LANES);
             }
             Step::Enough => self.alive &= !(1 << place),
         }
@@ -144,12 +192,12 @@ impl Packet {
 
     /// The rays of a mask meet the items of a leaf.
     #[inline(always)]
-    fn meet_leaf(
+    fn meet_leaf<M: Meeting>(
         &mut self,
         kernel: impl BoxKernel,
         view: &View<'_>,
         (leaf, mask): (Child, u64),
-        meeting: &mut impl Meeting,
+        meeting: &mut M,
     ) {
         let mut is_changed = false;
         for item in view.items(leaf.items()) {
@@ -180,16 +228,31 @@ impl Packet {
             for (corner, vertex) in corners.iter_mut().zip(view.corners(vertices)) {
                 *corner = [vertex[x], vertex[y], vertex[z]];
             }
+            let mut mask = mask;
+            if mask.count_ones() > FEW_TO_SIFT
+                && let Some(focus) = &self.focus
+            {
+                mask = kernel.sift(&self.groups, &kernel.sieve(&corners, focus), mask);
+            }
             let met = kernel.cross(&self.groups, &corners, mask, &mut self.crossings);
-            for place in places(met.certain) {
-                let t = self.crossings[place / LANES][place % LANES];
-                let step = meeting.cross(place, item, t);
-                is_changed |= self.take(place, &step);
+            for (k, crossing) in groups(met.certain) {
+                let group = (&mut self.groups[k], LANES * k);
+                let crossing = [crossing, met.within >> (LANES * k) & 0xFF];
+                let counts = meeting.cross_group(group, crossing, item, &self.crossings[k]);
+                if counts != 0 && M::ENDS {
+                    self.alive &= !(counts << (LANES * k));
+                } else if counts != 0 {
+                    self.shortened |= 1 << k;
+                }
+                is_changed |= counts != 0;
             }
             for place in places(met.possible & !met.certain) {
                 let step = meeting.ask(place, item, &self.shear(place), &BoxRay::NOWHERE);
                 is_changed |= self.take(place, &step);
             }
+        }
+        for k in places(std::mem::take(&mut self.shortened)) {
+            kernel.shorten(&mut self.groups[k % GROUPS], &self.turn);
         }
         if is_changed {
             self.shorten_beam();
@@ -307,9 +370,29 @@ impl Packet {
     }
 }
 
+/// Whether all rays of some groups start at one place.
+#[inline(always)]
+fn start_together(groups: &[RayGroup]) -> bool {
+    let first = &groups[0].origin;
+    let mut differences = 0;
+    for group in groups {
+        for (starts, first) in group.origin.iter().zip(first) {
+            let mut in_lanes = 0;
+            for start in starts {
+                in_lanes |= start.to_bits() ^ first[0].to_bits();
+            }
+            differences |= in_lanes;
+        }
+        if differences != 0 {
+            return false;
+        }
+    }
+    true
+}
+
 /// The bits of a mask.
 #[inline(always)]
-fn places(mut mask: u64) -> impl Iterator<Item = usize> {
+pub(super) fn places(mut mask: u64) -> impl Iterator<Item = usize> {
     std::iter::from_fn(move || {
         let place = mask.trailing_zeros() as usize;
         (mask != 0).then(|| {
@@ -357,15 +440,22 @@ pub(super) fn visit_packet(
             packet.shorten_beam();
         } else {
             let node = view.node(current.node(), room);
-            let (nears, mut met) = kernel.meet_beam(node, &packet.beam);
+            let (nears, mut met, within) = kernel.meet_beam(node, &packet.beam);
+            if met.is_power_of_two() {
+                // Boxes further down tell which rays enter them.
+                let child = node.children[met.trailing_zeros() as usize & 7];
+                if !child.is_leaf() {
+                    current = child;
+                    continue;
+                }
+            }
             let first = waiting;
             while met != 0 {
                 let child = met.trailing_zeros() as usize & 7;
                 met &= met - 1;
-                let planes = [packet.beam.near, packet.beam.far];
-                let [near, far] =
-                    planes.map(|[x, y, z]| [x, y, z].map(|axis: usize| node.planes[axis][child]));
-                let entering = kernel.enter(&packet.groups, [near, far], mask);
+                let is_within = within >> child & 1 == 1;
+                let entering =
+                    if is_within { mask } else { packet.enter(kernel, node, child, mask) };
                 if entering == 0 {
                     continue;
                 }

@@ -6,11 +6,12 @@ use glam::DVec3;
 
 use super::{
     batch::{Room, trace, trace_shadows},
+    kernels::{LaneWork, run_in_lanes},
     ray::{Hit, Ray},
 };
 use crate::{
     isa::Isa,
-    prepared::{PreparedScene, layout::View, record::Surface},
+    prepared::{PreparedScene, layout::View},
 };
 
 /// Rays that are copied and traced at once: few enough that they stay in the cache.
@@ -38,22 +39,23 @@ impl<'a> TimedKernels<'a> {
     /// ray is its start, its direction of length 1, its reach and a number that counts nothing; in
     /// the scene's units.
     pub fn meet(&mut self, rays: &[[f32; 8]], distances: &mut Vec<f64>) {
+        // A power of two, whose inverse is exact.
+        let from_units = 1.0 / self.view.header.scale;
+        distances.reserve(rays.len());
         for rays in rays.chunks(BATCH) {
             self.take(rays);
             let (view, hits) = (&self.view, &mut self.hits);
             let _ = trace(view, self.isa, &mut self.room, &self.rays, hits, &mut go_on);
             for hit in hits {
-                distances.push(if hit.is_some() {
-                    hit.t / self.view.header.scale
-                } else {
-                    f64::INFINITY
-                });
+                let t = if hit.is_some() { hit.t } else { f64::INFINITY };
+                distances.push(t * from_units);
             }
         }
     }
 
     /// The same: 0 where anything is met before the ray's reach.
     pub fn block(&mut self, rays: &[[f32; 8]], distances: &mut Vec<f64>) {
+        distances.reserve(rays.len());
         for rays in rays.chunks(BATCH) {
             self.take(rays);
             let (aim, shares) = ((&[][..], &self.rays[..]), &mut self.shares);
@@ -65,18 +67,32 @@ impl<'a> TimedKernels<'a> {
     }
 
     fn take(&mut self, rays: &[[f32; 8]]) {
+        self.rays.resize(rays.len(), Ray::NOWHERE);
         let scale = self.view.header.scale;
-        self.rays.clear();
-        self.rays.extend(rays.iter().map(|ray| {
-            let [x, y, z, dx, dy, dz, reach, _] = ray.map(f64::from);
-            Ray {
-                origin: scale * DVec3::new(x, y, z),
-                direction: DVec3::new(dx, dy, dz),
-                reach: scale * reach,
-                leaving: Surface::NONE,
-                after: Ray::NOTHING_AHEAD,
+        run_in_lanes(self.isa, &mut Widen { from: rays, scale, to: &mut self.rays });
+    }
+}
+
+/// Makes rays of those in single precision.
+struct Widen<'a> {
+    from: &'a [[f32; 8]],
+    scale: f64,
+    to: &'a mut [Ray],
+}
+
+impl LaneWork for Widen<'_> {
+    #[inline(always)]
+    fn run(&mut self) {
+        for (ray, from) in self.to.iter_mut().zip(self.from) {
+            let mut wide = [0.0; 8];
+            for (wide, &number) in wide.iter_mut().zip(from) {
+                *wide = f64::from(number);
             }
-        }));
+            let [x, y, z, dx, dy, dz, reach, _] = wide;
+            ray.origin = DVec3::new(self.scale * x, self.scale * y, self.scale * z);
+            ray.direction = DVec3::new(dx, dy, dz);
+            ray.reach = self.scale * reach;
+        }
     }
 }
 

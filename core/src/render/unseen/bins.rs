@@ -1,7 +1,10 @@
 //! The faces of a block of pixels, pixel by pixel.
 
-use super::outline::{Outline, Outlines};
+use super::outline::{Corner, Outline, Outlines};
 use crate::tile::Area;
+
+/// Room for rounding in the test of an edge, relative to its terms; rounding is 2^10 times finer.
+const MARGIN: f64 = 1.0 / (1_u64 << 40) as f64;
 
 /// Which of the outlines in a block's beam reach into which of its pixels.
 #[derive(Debug, Default)]
@@ -41,10 +44,15 @@ impl Bins {
                 first..last
             };
             let columns = within(0, block.columns().start, block.columns().end);
-            for y in within(1, block.rows().start, block.rows().end) {
+            let rows = within(1, block.rows().start, block.rows().end);
+            let triangle = Triangle::new(outlines.corners_of(&outlines.as_slice()[index]))
+                .filter(|_| columns.len() > 1 && rows.len() > 1);
+            for y in rows {
                 for x in columns.clone() {
                     let pixel = block.index_of(x, y) as usize;
-                    if *nearest <= self.deepest[pixel] {
+                    let is_passed =
+                        || triangle.as_ref().is_some_and(|triangle| triangle.surely_passes(x, y));
+                    if *nearest <= self.deepest[pixel] && !is_passed() {
                         self.faces[pixel].push(index);
                     }
                 }
@@ -60,5 +68,34 @@ impl Bins {
             .zip(&self.deepest)
             .zip(faces)
             .map(|((pixel, &deepest), faces)| (pixel, deepest, faces))
+    }
+}
+
+/// A triangle's edges on the screen.
+struct Triangle {
+    /// Their starts, and their steps in the sense in which the triangle's inside is to their right.
+    edges: [([f64; 2], [f64; 2]); 3],
+}
+
+impl Triangle {
+    /// It is `None` for other polygons.
+    fn new(corners: &[Corner]) -> Option<Self> {
+        let &[a, b, c] = corners else { return None };
+        let twice_area = (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0]);
+        let sign = 1.0_f64.copysign(twice_area);
+        let edges = [(a, b), (b, c), (c, a)]
+            .map(|(p, q)| ([p[0], p[1]], [sign * (q[0] - p[0]), sign * (q[1] - p[1])]));
+        Some(Self { edges })
+    }
+
+    /// Whether a pixel surely lies beyond one of the edges.
+    fn surely_passes(&self, x: u32, y: u32) -> bool {
+        let (x, y) = (f64::from(x), f64::from(y));
+        self.edges.iter().any(|&([from_x, from_y], [dx, dy])| {
+            // Its first corner's height over the edge, and how much higher another one may be.
+            let (p, q) = (dx * (y - from_y), dy * (x - from_x));
+            let more = dx.max(0.0) + (-dy).max(0.0);
+            p - q + more < -MARGIN * (p.abs() + q.abs() + more)
+        })
     }
 }

@@ -6,23 +6,37 @@ use super::{
     outline::Outlines,
     screen::{Beam, Screen},
 };
-use crate::prepared::{
-    layout::View,
-    node::{Child, Frame, Node},
+use crate::{
+    isa::Isa,
+    prepared::{
+        layout::View,
+        node::{Child, Frame, Node},
+    },
+    trace::kernels::{LaneWork, run_in_lanes},
 };
 
 /// Room for rounding in the test of a box, relative to its terms; rounding is 2^12 times finer.
 const MARGIN: f64 = 1.0 / (1_u64 << 40) as f64;
 
+/// Leaves that are found before their faces are looked at.
+const LEAVES: usize = 16;
+
 /// The search for the faces in a beam, and what the latest one found.
-#[derive(Debug, Default)]
+#[derive(Debug)]
 pub(super) struct FrustumSearch {
     /// The outlines of the faces that were found.
     pub(super) outlines: Outlines,
+    isa: Isa,
     waiting: Vec<Child>,
+    leaves: Vec<Child>,
 }
 
 impl FrustumSearch {
+    /// A search with the instructions of `isa`.
+    pub(super) fn new(isa: Isa) -> Self {
+        Self { outlines: Outlines::default(), isa, waiting: Vec::new(), leaves: Vec::new() }
+    }
+
     /// Collects the outlines of the faces in a beam. It gives up, and the answer is `false`, once
     /// there are more than `most`.
     pub(super) fn collect(
@@ -32,23 +46,48 @@ impl FrustumSearch {
         beam: &Beam,
         most: usize,
     ) -> bool {
-        self.outlines.clear();
-        self.waiting.clear();
-        self.waiting.push(Child::ROOT);
+        let Self { outlines, isa, waiting, leaves } = self;
+        outlines.clear();
+        waiting.clear();
+        waiting.push(Child::ROOT);
         let frustum = Frustum::new(screen, &view.header.frame, beam);
-        let mut room = Node::EMPTY;
-        while let Some(child) = self.waiting.pop() {
-            if child.is_leaf() {
-                for item in view.items(child.items()) {
-                    self.outlines.add_item(view, screen, item, beam);
+        while !waiting.is_empty() {
+            leaves.clear();
+            run_in_lanes(*isa, &mut Descent { view, frustum: &frustum, waiting, leaves });
+            for leaf in leaves.iter() {
+                for item in view.items(leaf.items()) {
+                    outlines.add_item(view, screen, item, beam);
                 }
-                if self.outlines.as_slice().len() > most {
+                if outlines.as_slice().len() > most {
                     return false;
                 }
+            }
+        }
+        true
+    }
+}
+
+/// The way down the hierarchy to the next leaves that may reach into a frustum.
+struct Descent<'s, 'a> {
+    view: &'s View<'a>,
+    frustum: &'s Frustum,
+    waiting: &'s mut Vec<Child>,
+    leaves: &'s mut Vec<Child>,
+}
+
+impl LaneWork for Descent<'_, '_> {
+    #[inline(always)]
+    fn run(&mut self) {
+        let mut room = Node::EMPTY;
+        while self.leaves.len() < LEAVES
+            && let Some(child) = self.waiting.pop()
+        {
+            if child.is_leaf() {
+                self.leaves.push(child);
                 continue;
             }
-            let node = view.node(child.node(), &mut room);
-            let mut mask = frustum.boxes_met(&node.planes);
+            let node = self.view.node(child.node(), &mut room);
+            let mut mask = self.frustum.boxes_met(&node.planes);
             while mask != 0 {
                 let child = node.children[mask.trailing_zeros() as usize & 7];
                 mask &= mask - 1;
@@ -57,41 +96,49 @@ impl FrustumSearch {
                 }
             }
         }
-        true
     }
 }
 
 /// The planes that bound a beam, in the frame of the boxes.
 struct Frustum {
     planes: [BoundingPlane; 6],
+    /// That of what is within reach.
+    reach: Option<BoundingPlane>,
 }
 
 impl Frustum {
     fn new(screen: &Screen, frame: &Frame, beam: &Beam) -> Self {
-        let [depth, across, down] = screen.inverse_rows();
+        let rows = screen.inverse_rows();
         let origin = (DVec3::from_array(frame.origin) - screen.eye()) * frame.scale;
-        let plane = |row: DVec3, factor: f64, sign: f64, depth_limit: f64| {
-            let normal = sign * (row - factor * depth);
-            let terms = row.abs() + factor * depth.abs();
-            let slack = terms.dot(origin.abs() + 1.0) + depth_limit;
-            BoundingPlane { normal, least: -(normal.dot(origin) + depth_limit) - slack * MARGIN }
+        // A sum over depth, column and row, the latter two times the depth, and a distance.
+        let plane = |factors: [f64; 3], distance: f64| {
+            let (mut normal, mut terms) = (DVec3::ZERO, DVec3::ZERO);
+            for (row, factor) in rows.into_iter().zip(factors) {
+                normal += factor * row;
+                terms += factor.abs() * row.abs();
+            }
+            let slack = terms.dot(origin.abs() + 1.0) + distance.abs();
+            BoundingPlane { normal, least: -(normal.dot(origin) + distance) - slack * MARGIN }
         };
         let ([x0, y0], [x1, y1]) = (beam.block.low, beam.block.high);
         let planes = [
-            plane(across, x0, 1.0, 0.0),
-            plane(across, x1, -1.0, 0.0),
-            plane(down, y0, 1.0, 0.0),
-            plane(down, y1, -1.0, 0.0),
-            plane(depth, 0.0, 1.0, 0.0),
-            plane(depth, 0.0, -1.0, beam.deepest * frame.scale),
+            plane([-x0, 1.0, 0.0], 0.0),
+            plane([x1, -1.0, 0.0], 0.0),
+            plane([-y0, 0.0, 1.0], 0.0),
+            plane([y1, 0.0, -1.0], 0.0),
+            plane([1.0, 0.0, 0.0], 0.0),
+            plane([-1.0, 0.0, 0.0], beam.deepest * frame.scale),
         ];
-        Self { planes }
+        let reach = beam.reach.factors();
+        let reach = reach.map(|(factors, height)| plane(factors, height * frame.scale));
+        Self { planes, reach }
     }
 
     /// Tells which of a node's boxes may reach into the frustum, a bit each, the first one lowest.
+    #[inline(always)]
     fn boxes_met(&self, boxes: &[[f32; 8]; 6]) -> u32 {
         let mut mask = 0xFF;
-        for plane in &self.planes {
+        for plane in self.planes.iter().chain(&self.reach) {
             mask &= plane.boxes_met(boxes);
             if mask == 0 {
                 break;
@@ -109,6 +156,7 @@ struct BoundingPlane {
 
 impl BoundingPlane {
     /// Tells which of a node's boxes may reach over the plane to the inside, a bit each.
+    #[inline(always)]
     fn boxes_met(&self, boxes: &[[f32; 8]; 6]) -> u32 {
         let normal = self.normal.to_array();
         let mut highest = [0.0; 8];

@@ -44,6 +44,19 @@ pub(super) struct Judge<'a> {
     clipper: Clipper,
     /// The indices of the outlines that the pixel's samples did not meet.
     suspects: Vec<usize>,
+    /// What was cut out of the first of the faces in a pixel, `None` where nothing is seen of one, and
+    /// the corners of it all.
+    pieces: Vec<Option<Piece>>,
+    corners: Vec<Corner>,
+}
+
+/// What a pixel cuts out of a face.
+#[derive(Debug, Clone, Copy)]
+struct Piece {
+    fragment: Fragment,
+    /// The index of its first corner among those of all pieces.
+    first: usize,
+    corner_count: usize,
 }
 
 impl<'a> Judge<'a> {
@@ -54,6 +67,8 @@ impl<'a> Judge<'a> {
             error,
             clipper: Clipper::default(),
             suspects: Vec::new(),
+            pieces: Vec::new(),
+            corners: Vec::new(),
         }
     }
 
@@ -77,17 +92,21 @@ impl<'a> Judge<'a> {
         let is_filled = own.is_none_or(|own| fills(outlines.corners_of(own), &pixel));
         if suspects.len() > usize::from(own.is_some()) || !is_filled {
             let seen = self.seen(sight, first).map(|seen| Seen::new(sight, seen));
+            self.pieces.clear();
+            self.corners.clear();
             if let (Some(seen), false) = (&seen, is_filled) {
                 let faces = (outlines, suspects);
                 if let Some(gap) = self.find_gap(sight, faces, &pixel, (first, seen), around) {
                     unseen.add_gap(gap);
                 }
             }
-            for &index in suspects {
+            for (place, &index) in suspects.iter().enumerate() {
                 let outline = &outlines.as_slice()[index];
                 let met = (first, seen.as_ref());
-                if first.hit.rank != outline.rank {
-                    self.judge(sight, (outlines, outline), &pixel, met, &mut unseen);
+                let piece = self.pieces.get(place).copied();
+                if first.hit.rank != outline.rank && !matches!(piece, Some(None)) {
+                    let piece = piece.flatten();
+                    self.judge(sight, (outlines, outline), &pixel, met, piece, &mut unseen);
                 }
             }
             self.drop_negligible(&mut unseen, 1);
@@ -127,19 +146,12 @@ impl<'a> Judge<'a> {
         // What covers the pixel, first without its corners: few gaps are worth noting.
         let mut shares = [0.0; 2];
         let left = |shares: [f64; 2]| 1.0 - f64::max(shares[0], shares[1]);
-        let cut = |outline: &Outline, clipper: &mut Clipper| {
-            let corners = outlines.corners_of(outline);
-            if seen.surely_hides(corners) {
-                return None;
-            }
-            let fragment = Fragment::new(corners, &outline.bounds, pixel, &sight.reach, clipper)?;
-            let nearest = sight.screen.point(fragment.nearest);
-            (!is_behind(sight, nearest, &seen.surfel)).then_some(fragment)
-        };
         for &index in suspects {
-            if let Some(fragment) = cut(&outlines.as_slice()[index], &mut self.clipper) {
+            let piece = self.cut(sight, (outlines, &outlines.as_slice()[index]), pixel, seen);
+            if let Some(Piece { fragment, .. }) = piece {
                 shares[usize::from(fragment.is_front)] += fragment.share;
             }
+            self.pieces.push(piece);
             // The more there is the less is left.
             if self.is_negligible(left(shares), most) {
                 return None;
@@ -153,23 +165,46 @@ impl<'a> Judge<'a> {
         if self.is_negligible(share, contrast) {
             return None;
         }
-        let mut covers = Vec::new();
-        for &index in suspects {
-            if cut(&outlines.as_slice()[index], &mut self.clipper).is_some() {
-                covers.push(self.clipper.polygon().to_vec());
-            }
-        }
+        let covers = self.pieces.iter().flatten().map(|piece| self.corners_of(piece).to_vec());
+        let covers = covers.collect();
         Some(Gap { covers, share, contrast })
     }
 
+    /// Cuts a face to the pixel, if what is left does not stand behind what was seen.
+    fn cut(
+        &mut self,
+        sight: &Sight<'_>,
+        (outlines, outline): (&Outlines, &Outline),
+        pixel: &Rectangle,
+        seen: &Seen,
+    ) -> Option<Piece> {
+        let corners = outlines.corners_of(outline);
+        if seen.surely_hides(corners) {
+            return None;
+        }
+        let (bounds, clipper) = (&outline.bounds, &mut self.clipper);
+        let fragment = Fragment::new(corners, bounds, pixel, &sight.reach, clipper)?;
+        if is_behind(sight, sight.screen.point(fragment.nearest), &seen.surfel) {
+            return None;
+        }
+        let (first, corner_count) = (self.corners.len(), clipper.polygon().len());
+        self.corners.extend(clipper.polygon());
+        Some(Piece { fragment, first, corner_count })
+    }
+
+    fn corners_of(&self, piece: &Piece) -> &[Corner] {
+        &self.corners[piece.first..piece.first + piece.corner_count]
+    }
+
     /// Adds a face to what a pixel may hide, unless it shows nothing new there, is hidden or has
-    /// been passed by a sample.
+    /// been passed by a sample. `piece` is what was cut out of it, if that was done.
     fn judge(
         &mut self,
         sight: &Sight<'_>,
         (outlines, outline): (&Outlines, &Outline),
         pixel: &Rectangle,
         (first, seen): (&FirstSample, Option<&Seen>),
+        piece: Option<Piece>,
         unseen: &mut UnseenFaces,
     ) {
         let material = outline.face.material_index(self.view);
@@ -180,7 +215,7 @@ impl<'a> Judge<'a> {
         }
         let corners = outlines.corners_of(outline);
         if let Some(seen) = seen {
-            if seen.surely_hides(corners) {
+            if piece.is_none() && seen.surely_hides(corners) {
                 return;
             }
             let is_flat = !outline.face.is_round(self.view);
@@ -195,16 +230,18 @@ impl<'a> Judge<'a> {
                 }
             }
         }
-        let Some(fragment) =
-            Fragment::new(corners, &outline.bounds, pixel, &sight.reach, &mut self.clipper)
-        else {
-            return;
+        let (bounds, clipper) = (&outline.bounds, &mut self.clipper);
+        let fragment = match &piece {
+            Some(piece) => Some(piece.fragment),
+            None => Fragment::new(corners, bounds, pixel, &sight.reach, clipper),
         };
+        let Some(fragment) = fragment else { return };
         if self.is_negligible(fragment.share, contrast) {
             return;
         }
         let seen = seen.map(|seen| &seen.surfel);
-        if seen.is_some_and(|seen| is_behind(sight, sight.screen.point(fragment.nearest), seen)) {
+        let hides = |seen| is_behind(sight, sight.screen.point(fragment.nearest), seen);
+        if piece.is_none() && seen.is_some_and(hides) {
             return;
         }
         let surfel = self.surfel(sight, outline, fragment.middle);
@@ -214,11 +251,12 @@ impl<'a> Judge<'a> {
         if self.is_negligible(fragment.share, contrast) {
             return;
         }
-        if contains(self.clipper.polygon(), first.place) {
+        let polygon = piece.as_ref().map_or(self.clipper.polygon(), |piece| self.corners_of(piece));
+        if contains(polygon, first.place) {
             return;
         }
         let rows = [outline.bounds.low[1], outline.bounds.high[1]];
-        unseen.add(&fragment, self.clipper.polygon(), rows, contrast, surfel);
+        unseen.add(&fragment, polygon, rows, contrast, surfel);
     }
 
     /// The piece of a face at a corner.
@@ -270,7 +308,8 @@ impl<'a> Judge<'a> {
         };
         suspects.retain(|&index| {
             let outline = &outlines.as_slice()[index];
-            let is_passed = contains(outlines.corners_of(outline), place)
+            let is_passed = !self.is_negligible(1.0, light)
+                && contains(outlines.corners_of(outline), place)
                 && cut(outline, &mut clipper).is_some()
                 && contains(clipper.polygon(), place);
             if is_passed {
@@ -278,6 +317,9 @@ impl<'a> Judge<'a> {
             }
             !is_passed
         });
+        if self.is_negligible(1.0, light) {
+            suspects.clear();
+        }
         for &index in &suspects {
             let outline = &outlines.as_slice()[index];
             let contrast = (1.0 - share_kept(outline)) * light;

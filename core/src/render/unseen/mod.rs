@@ -76,7 +76,7 @@ impl<'a> UnseenSearch<'a> {
     ) -> Option<Self> {
         let screen = Screen::new(&view.header.camera, frame)?;
         let judge = Judge::new(view, flat, error);
-        let (frustum_search, bins) = Default::default();
+        let (frustum_search, bins) = (FrustumSearch::new(isa), Bins::default());
         let onward = OnwardSearch::new(view, flat, isa);
         Some(Self { view, screen, frustum_search, bins, judge, onward })
     }
@@ -116,7 +116,8 @@ impl<'a> UnseenSearch<'a> {
         for block in area.blocks(side) {
             let mut bins = std::mem::take(&mut self.bins);
             bins.start(block, |x, y| self.deepest(x, y, &firsts.of(x, y).hit));
-            let beam = Beam { block: Rectangle::of_block(block), deepest: bins.deepest() };
+            let (block_bounds, deepest) = (Rectangle::of_block(block), bins.deepest());
+            let beam = Beam { block: block_bounds, deepest, reach: Reach::Whole };
             if self.frustum_search.collect(self.view, &self.screen, &beam, most) {
                 bins.fill(&self.frustum_search.outlines);
                 for ((x, y), deepest, faces) in bins.pixels() {
@@ -147,7 +148,7 @@ impl<'a> UnseenSearch<'a> {
         let middle = self.screen.pixel_direction(x, y).length();
         let clearance = 1.0 - CROWDED_CLEARANCE * self.screen.pixel_side() / middle;
         let deepest = first.hit.t / middle * clearance;
-        let beam = Beam { block: Rectangle::of_pixel(x, y), deepest };
+        let beam = Beam { block: Rectangle::of_pixel(x, y), deepest, reach: Reach::Whole };
         if self.frustum_search.collect(self.view, &self.screen, &beam, MOST_FACES) {
             let faces = self.frustum_search.outlines.by_rank();
             self.find_unseen((x, y), deepest, &faces, firsts, on_found);
@@ -199,6 +200,7 @@ mod tests {
 
     use super::{
         outline::{Clipper, Fragment, Outline, Outlines},
+        screen::Sheet,
         *,
     };
     use crate::{
@@ -265,20 +267,26 @@ mod tests {
             ranks.sort_unstable();
             ranks
         };
-        let mut search = FrustumSearch::default();
-        let mut total = 0;
+        let mut search = FrustumSearch::new(Isa::fastest());
+        let point = screen.eye() + 1.5 * screen.pixel_direction(20, 15);
+        let sheet = Sheet::new(&screen, point, DVec3::new(0.6, 0.0, 0.8)).unwrap();
+        let mut totals = [0; 3];
         for block in [1, 2, 8].into_iter().flat_map(|side| Area::whole(size).blocks(side)) {
             for deepest in [0.7, 2.0, f64::INFINITY] {
-                let beam = Beam { block: Rectangle::of_block(block), deepest };
-                assert!(search.collect(&view, &screen, &beam, usize::MAX));
-                let mut all = Outlines::default();
-                view.all_items().for_each(|item| all.add_item(&view, &screen, item, &beam));
-                assert_eq!(ranks(&search.outlines), ranks(&all), "{block:?}");
-                total += all.as_slice().len();
+                let reaches = [Reach::Whole, Reach::Before(sheet), Reach::Behind(sheet)];
+                for (reach, total) in reaches.into_iter().zip(&mut totals) {
+                    let beam = Beam { block: Rectangle::of_block(block), deepest, reach };
+                    assert!(search.collect(&view, &screen, &beam, usize::MAX));
+                    let mut all = Outlines::default();
+                    view.all_items().for_each(|item| all.add_item(&view, &screen, item, &beam));
+                    assert_eq!(ranks(&search.outlines), ranks(&all), "{block:?} {reach:?}");
+                    *total += all.as_slice().len();
+                }
             }
         }
-        eprintln!("{total} faces in all beams");
-        assert!(total > 1000);
+        let [whole, before, behind] = totals;
+        eprintln!("{totals:?} faces in all beams");
+        assert!(before > 1000 && behind > 1000 && before < whole && behind < whole);
     }
 
     #[test]
@@ -288,8 +296,9 @@ mod tests {
         let size = Size::new(40, 30).unwrap();
         let screen = Screen::new(&view.header.camera, size).unwrap();
         let frame = Area::whole(size);
-        let beam = Beam { block: Rectangle::of_block(frame), deepest: f64::INFINITY };
-        let mut search = FrustumSearch::default();
+        let block = Rectangle::of_block(frame);
+        let beam = Beam { block, deepest: f64::INFINITY, reach: Reach::Whole };
+        let mut search = FrustumSearch::new(Isa::fastest());
         assert!(search.collect(&view, &screen, &beam, usize::MAX));
         let inside = |&&Outline { bounds: Rectangle { low, high }, .. }: &&Outline| {
             low[0] > 0.0 && low[1] > 0.0 && high[0] < 40.0 && high[1] < 30.0

@@ -127,15 +127,16 @@ impl<'a> OnwardSearch<'a> {
         mut tools: Tools<'_, 'a, impl FnMut(u32, u32, UnseenFaces)>,
         look: &impl Fn(u32, u32) -> Option<FirstSample>,
     ) {
+        let mut looks = Vec::new();
         for square in area.squares_of_frame(SQUARES[0].0) {
-            let looks = square.common_pixels(area).filter_map(|(x, y)| {
+            looks.clear();
+            looks.extend(square.common_pixels(area).filter_map(|(x, y)| {
                 let first = look(x, y)?;
                 let surface = first.hit.face.surface(self.view);
                 Some(Look { x, y, first, surface, weight: 1.0 })
-            });
-            let looks = looks.collect();
+            }));
             self.beam = 0;
-            self.follow(screen, square, looks, 1, &mut tools);
+            self.follow(screen, square, &mut looks, 1, &mut tools);
         }
     }
 
@@ -145,7 +146,7 @@ impl<'a> OnwardSearch<'a> {
         &mut self,
         screen: &Screen,
         square: Area,
-        mut looks: Vec<Look>,
+        looks: &mut [Look],
         depth: u32,
         tools: &mut Tools<'_, 'a, impl FnMut(u32, u32, UnseenFaces)>,
     ) {
@@ -174,8 +175,9 @@ impl<'a> OnwardSearch<'a> {
                 let Some(seen) = seen else { continue };
                 self.search_way(&seen, &sheet, &next, tools);
                 if depth < MOST_SURFACES {
-                    let next = next.into_iter().filter(|look| look.first.hit.is_some()).collect();
-                    self.follow(&seen, square, next, depth + 1, tools);
+                    let mut next = next;
+                    next.retain(|look| look.first.hit.is_some());
+                    self.follow(&seen, square, &mut next, depth + 1, tools);
                 }
             }
         }
@@ -300,11 +302,11 @@ impl<'a> OnwardSearch<'a> {
         for look in looks {
             let (x, y, first) = (look.x, look.y, &look.first);
             let deepest = DEPTH_RATIO * first.hit.t / screen.direction(first.place).length();
-            let beam = Beam { block: Rectangle::of_pixel(x, y), deepest };
+            let reach = Reach::Behind(*sheet);
+            let beam = Beam { block: Rectangle::of_pixel(x, y), deepest, reach };
             if !tools.frustum_search.collect(self.view, screen, &beam, MOST_FACES) {
                 continue;
             }
-            let reach = Reach::Behind(*sheet);
             let sight = Sight { screen, beam: self.beam, reach, weight: look.weight, deepest };
             let outlines = &tools.frustum_search.outlines;
             let faces = outlines.by_rank();

@@ -191,7 +191,10 @@ impl Outlines {
             *corner = [corner[0] * inverse, corner[1] * inverse, inverse];
             bounds.add([corner[0], corner[1]]);
         }
-        if nearest <= beam.deepest && bounds.overlaps(&beam.block) {
+        let is_within_reach = matches!(beam.reach, Reach::Whole)
+            || self.corners[first..].iter().any(|&corner| beam.reach.height(corner) >= 0.0)
+                && !beam.reach.surely_misses(screen, corners, &beam.block);
+        if nearest <= beam.deepest && bounds.overlaps(&beam.block) && is_within_reach {
             let corner_count = self.corners.len() - first;
             let rank = face.rank(view).expect("a face of the scene");
             self.faces.push(Outline { face, rank, first, corner_count, bounds, nearest });

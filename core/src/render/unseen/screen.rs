@@ -112,6 +112,9 @@ pub(super) struct Sheet {
 /// Faces begin this share of their depth before or behind a surface.
 const CLEARANCE: f64 = 1e-9;
 
+/// With this clearance they surely do, although polygons are flat only within rounding.
+const SURE_CLEARANCE: f64 = 1.0 / 1024.0;
+
 impl Sheet {
     /// The plane through a point; `None` where the eye is in it.
     pub(super) fn new(screen: &Screen, point: DVec3, normal: DVec3) -> Option<Self> {
@@ -153,6 +156,37 @@ impl Reach {
             Self::Behind(sheet) => sheet.inverse_depth([x, y]) * (1.0 - CLEARANCE) - inverse_depth,
         }
     }
+
+    /// Whether all of a flat polygon, by its corners relative to the eye, that is in a rectangle of the screen
+    /// is surely out of reach.
+    pub(super) fn surely_misses(
+        &self,
+        screen: &Screen,
+        corners: &[DVec3],
+        rectangle: &Rectangle,
+    ) -> bool {
+        let (&[a, b, c, ..], Self::Before(sheet) | Self::Behind(sheet)) = (corners, self) else {
+            return false;
+        };
+        let normal = (b - a).cross(c - a);
+        let Some(own) = Sheet::new(screen, a + screen.eye, normal) else { return false };
+        rectangle.corners().iter().all(|&corner| {
+            let (own, sheet) = (own.inverse_depth(corner), sheet.inverse_depth(corner));
+            let room = SURE_CLEARANCE * (own.abs() + sheet.abs());
+            if matches!(self, Self::Before(_)) { own + room < sheet } else { own - room > sheet }
+        })
+    }
+
+    /// The same times the depth, as a sum over the depth and the place times the depth, and what is
+    /// added to it: `None` where all is within reach.
+    pub(super) fn factors(&self) -> Option<([f64; 3], f64)> {
+        let times = |sheet: &Sheet, factor: f64| sheet.inverse_depth.map(|depth| depth * factor);
+        match self {
+            Self::Whole => None,
+            Self::Before(sheet) => Some((times(sheet, -1.0 - CLEARANCE), 1.0)),
+            Self::Behind(sheet) => Some((times(sheet, 1.0 - CLEARANCE), -1.0)),
+        }
+    }
 }
 
 /// A rectangle on the screen, in pixels: from the lowest (x, y) to the highest.
@@ -178,6 +212,12 @@ impl Rectangle {
     /// The square of a pixel.
     pub(super) fn of_pixel(x: u32, y: u32) -> Self {
         Self { low: [x.into(), y.into()], high: [(x + 1).into(), (y + 1).into()] }
+    }
+
+    /// Its corners.
+    fn corners(&self) -> [[f64; 2]; 4] {
+        let Self { low: [x0, y0], high: [x1, y1] } = *self;
+        [[x0, y0], [x0, y1], [x1, y0], [x1, y1]]
     }
 
     /// Grows to hold a place.
@@ -208,16 +248,19 @@ pub(super) struct Beam {
     pub(super) block: Rectangle,
     /// Faces that begin at a larger depth do not count.
     pub(super) deepest: f64,
+    /// Nor do faces that are out of reach as a whole.
+    pub(super) reach: Reach,
 }
 
 impl Beam {
     /// A beam up to a surface.
     pub(super) fn before(sheet: &Sheet, block: Rectangle) -> Self {
-        let Rectangle { low: [x0, y0], high: [x1, y1] } = block;
-        let least = [[x0, y0], [x0, y1], [x1, y0], [x1, y1]]
+        let least = block
+            .corners()
             .map(|corner| sheet.inverse_depth(corner))
             .into_iter()
             .fold(f64::INFINITY, f64::min);
-        Self { block, deepest: if least > 0.0 { 1.0 / least } else { f64::INFINITY } }
+        let deepest = if least > 0.0 { 1.0 / least } else { f64::INFINITY };
+        Self { block, deepest, reach: Reach::Before(*sheet) }
     }
 }
