@@ -1,6 +1,6 @@
 //! Hashes the sources that pixels and messages depend on, so that a coordinator knows workers that
-//! were built from others. The same sources give the same hash on every machine, with every compiler
-//! and profile; what these make of them, the reference tile shows.
+//! were built from others. The same sources give the same hash on every machine, with every
+//! compiler and profile; what these make of them, the reference tile shows.
 
 use std::{fs, io, path::Path};
 

@@ -123,8 +123,8 @@ fn render(
     Ok([started.elapsed().as_secs_f64(), processor_time()? - before])
 }
 
-/// Seconds of processor time of all processes that this one has started and waited for, and of those
-/// that they had. See `proc_pid_stat(5)`; a tick is 10 ms.
+/// Seconds of processor time of all processes that this one has started and waited for, and of
+/// those that they had. See `proc_pid_stat(5)`; a tick is 10 ms.
 fn processor_time() -> anyhow::Result<f64> {
     let line = fs::read_to_string("/proc/self/stat")?;
     let (_, fields) = line.rsplit_once(')').context("a process has a name")?;

@@ -1,6 +1,6 @@
 //! Writes `gnome.rt` to standard output: a garden gnome and his bottle on a terrace, with a mirror
-//! behind them, a red ball, a die and toadstools. Everything is spheres, boxes, quadrangles and what the
-//! arithmetic of solids makes of them.
+//! behind them, a red ball, a die and toadstools. Everything is spheres, boxes, quadrangles and
+//! what the arithmetic of solids makes of them.
 //!
 //!     cargo run --example make_gnome > scenes/gnome.rt
 

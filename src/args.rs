@@ -167,8 +167,8 @@ pub(crate) struct CheckArgs {
 
 #[derive(Debug, ClapArgs)]
 pub(crate) struct VerifyArgs {
-    /// The picture, which says itself with which settings it was rendered; those that are given here must
-    /// be the same.
+    /// The picture, which says itself with which settings it was rendered; those that are given
+    /// here must be the same.
     #[arg(value_name = "IMAGE")]
     pub(crate) image: PathBuf,
 
@@ -178,7 +178,8 @@ pub(crate) struct VerifyArgs {
     #[command(flatten)]
     pub(crate) settings: SettingArgs,
 
-    /// So many tiles, which are drawn by chance, or `all`; by default some, at least 8 and at most 1024.
+    /// So many tiles, which are drawn by chance, or `all`; by default some, at least 8 and at most
+    /// 1024.
     #[arg(long, value_name = "N|all", default_value = "few", hide_default_value = true, help_heading = WORK)]
     pub(crate) tiles: TileShare,
 
@@ -255,8 +256,9 @@ pub(crate) struct RenderArgs {
 
     /// Go on with what an earlier render with --resume left when it was interrupted.
     ///
-    /// The folder FILE.rtfarm has it until the picture is there. Of --frames, those whose picture is there,
-    /// rendered from the same scene with the same settings by this build, are passed over.
+    /// The folder FILE.rtfarm has it until the picture is there. Of --frames, those whose picture
+    /// is there, rendered from the same scene with the same settings by this build, are passed
+    /// over.
     #[arg(long, conflicts_with = "time", help_heading = WORK)]
     pub(crate) resume: bool,
 
@@ -269,8 +271,9 @@ pub(crate) struct RenderArgs {
 
     /// Have workers of a cluster render: Slurm gets an array of them with these options of sbatch.
     ///
-    /// Such as "--array=1-8 --cpus-per-task=16 --time=30". The nodes must share the disk of FILE and of
-    /// this program; a folder beside FILE has their access file and their logs until the picture is there.
+    /// Such as "--array=1-8 --cpus-per-task=16 --time=30". The nodes must share the disk of FILE
+    /// and of this program; a folder beside FILE has their access file and their logs until the
+    /// picture is there.
     #[arg(long, value_name = "OPTIONS", allow_hyphen_values = true, conflicts_with_all = ["workers", "threads", "isa", "time"], help_heading = WORK)]
     pub(crate) slurm: Option<SbatchOptions>,
 
@@ -294,8 +297,8 @@ pub(crate) struct RenderArgs {
     #[arg(long, value_name = "S", default_value = "4", value_parser = parse_seconds, help_heading = WORK)]
     pub(crate) lease_seconds: Duration,
 
-    /// How long to go on though no worker process does anything; with --slurm, how long workers go on
-    /// when this process is gone.
+    /// How long to go on though no worker process does anything; with --slurm, how long workers go
+    /// on when this process is gone.
     #[arg(long, value_name = "S", default_value = "60", value_parser = parse_seconds, help_heading = WORK)]
     pub(crate) patience: Duration,
 
@@ -307,8 +310,8 @@ pub(crate) struct RenderArgs {
 
     /// Draw the picture in the terminal as it comes, coarsely.
     ///
-    /// By the protocol of Kitty or iTerm2 or by sixels; a terminal that has none of them is told of, and the
-    /// picture is rendered without. With --quiet, too, and whatever `NO_COLOR` says.
+    /// By the protocol of Kitty or iTerm2 or by sixels; a terminal that has none of them is told
+    /// of, and the picture is rendered without. With --quiet, too, and whatever `NO_COLOR` says.
     #[arg(long, help_heading = TALK)]
     pub(crate) preview: bool,
 
@@ -318,8 +321,8 @@ pub(crate) struct RenderArgs {
 }
 
 impl Args {
-    /// Reads the command line. A number below zero is a value of its option there, so that what is said
-    /// of it is what would be right.
+    /// Reads the command line. A number below zero is a value of its option there, so that what is
+    /// said of it is what would be right.
     pub(crate) fn read() -> Result<Self, clap::Error> {
         let takes_numbers = |argument: Arg| {
             let takes = argument.get_action().takes_values();

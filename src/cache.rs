@@ -1,9 +1,9 @@
 //! Prepared scenes that are kept between renders, in the user's cache folder.
 //!
-//! An entry is found by the scene's text, and used if every file that the scene names has the content
-//! that it had; so nobody has to say when something changed. It is a file: a line with a hash and what
-//! it is the hash of, as JSON, and the prepared scene, which has a hash of its own. One that is damaged,
-//! foreign or of another build is as good as none.
+//! An entry is found by the scene's text, and used if every file that the scene names has the
+//! content that it had; so nobody has to say when something changed. It is a file: a line with a
+//! hash and what it is the hash of, as JSON, and the prepared scene, which has a hash of its own.
+//! One that is damaged, foreign or of another build is as good as none.
 
 use std::{
     fs::{self, DirBuilder, File, Metadata},

@@ -92,8 +92,8 @@ impl Children {
 
     /// Tells `coordinator` of every worker that dies and starts another in its place, a limited
     /// number of times; one that stays stopped is killed. Returns when no worker is left, or none
-    /// has done anything for so long as `patience`, with what to say of it. Await it on the thread that
-    /// has started the first workers.
+    /// has done anything for so long as `patience`, with what to say of it. Await it on the thread
+    /// that has started the first workers.
     pub(crate) async fn keep_up(
         &mut self,
         coordinator: &Coordinator,
@@ -142,8 +142,8 @@ impl Children {
         is_last.then(|| format!("all workers are dead; the last one: {reason}"))
     }
 
-    /// Kills workers that stay stopped. Answers with the time that all have had on a processor, which
-    /// grows as long as any does something.
+    /// Kills workers that stay stopped. Answers with the time that all have had on a processor,
+    /// which grows as long as any does something.
     fn look(&mut self) -> u64 {
         let mut ticks = 0;
         for (&process, looks_stopped) in &mut self.looks_stopped {
@@ -181,8 +181,8 @@ impl Children {
     }
 }
 
-/// Has glibc keep what a tile's buffers took for the next tile. It would give it back to the system, and
-/// fault it in again page by page: a fifth of a cheap picture's processor time.
+/// Has glibc keep what a tile's buffers took for the next tile. It would give it back to the
+/// system, and fault it in again page by page: a fifth of a cheap picture's processor time.
 const MALLOC: [(&str, &str); 2] =
     [("MALLOC_MMAP_THRESHOLD_", "33554432"), ("MALLOC_TRIM_THRESHOLD_", "67108864")];
 

@@ -1,5 +1,5 @@
-//! Standard error: log lines, the progress bar and a picture above it, which share it. Nobody here waits
-//! for who reads it.
+//! Standard error: log lines, the progress bar and a picture above it, which share it. Nobody here
+//! waits for who reads it.
 
 use std::{
     io::{self, IsTerminal, Write},
@@ -46,8 +46,8 @@ impl Console {
         Self::default()
     }
 
-    /// Standard error as a command uses it: with a bar on a terminal, with log lines elsewhere, unless
-    /// it is to be quiet or verbose. `RUST_LOG` chooses others.
+    /// Standard error as a command uses it: with a bar on a terminal, with log lines elsewhere,
+    /// unless it is to be quiet or verbose. `RUST_LOG` chooses others.
     pub(crate) fn new(args: &Args) -> Self {
         let Args { command, quiet: is_quiet, verbose: is_verbose } = args;
         let format = command.log_format();
@@ -104,7 +104,8 @@ impl Console {
         let _ = writeln!(self.make_writer(), "{line}");
     }
 
-    /// Writes a line to standard output; where that is a terminal, which may be the same one, in its turn.
+    /// Writes a line to standard output; where that is a terminal, which may be the same one, in
+    /// its turn.
     pub(crate) fn answer(&self, line: &str) -> io::Result<()> {
         let mut out = io::stdout();
         match &self.queue {

@@ -1,6 +1,7 @@
-//! What is to be said on standard error and shown there, written by a thread of its own: whoever says it
-//! never waits for whoever reads. What comes close together is written together. Lines that do not fit into
-//! the queue are dropped, and how many there were is told; of bars and pictures only the last waits.
+//! What is to be said on standard error and shown there, written by a thread of its own: whoever
+//! says it never waits for whoever reads. What comes close together is written together. Lines that
+//! do not fit into the queue are dropped, and how many there were is told; of bars and pictures
+//! only the last waits.
 
 use std::{
     mem,

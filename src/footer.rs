@@ -32,8 +32,8 @@ impl Shown {
 }
 
 impl Footer {
-    /// Writes lines in place of the picture, then the picture and a bar of at most so many characters.
-    /// Lines for standard output go to `answers`.
+    /// Writes lines in place of the picture, then the picture and a bar of at most so many
+    /// characters. Lines for standard output go to `answers`.
     pub(crate) fn write(
         &mut self,
         batch: Batch,
@@ -82,7 +82,8 @@ impl Footer {
         bytes.extend(self.picture.take().map(Shown::clear).unwrap_or_default().into_bytes());
     }
 
-    /// Draws a picture in place of the one that is there. The cursor is in the row below it at the end.
+    /// Draws a picture in place of the one that is there. The cursor is in the row below it at the
+    /// end.
     fn draw(&mut self, drawing: Drawing, bytes: &mut Vec<u8>) {
         let Drawing { bytes: drawn, rows, erase } = drawing;
         match self.picture.take() {
@@ -103,7 +104,8 @@ impl Footer {
 mod tests {
     use super::*;
 
-    /// What is written for each of several batches, one after the other, to a terminal ten characters wide.
+    /// What is written for each of several batches, one after the other, to a terminal ten
+    /// characters wide.
     fn check_written(batches: Vec<(Batch, &str)>) {
         let mut footer = Footer::default();
         for (number, (batch, expected)) in batches.into_iter().enumerate() {

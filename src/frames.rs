@@ -53,7 +53,8 @@ impl FrameRange {
         (self.first..=self.last).step_by(self.step as usize)
     }
 
-    /// The pictures that are wanted when `of_all` says what is wanted of each. All scenes are there.
+    /// The pictures that are wanted when `of_all` says what is wanted of each. All scenes are
+    /// there.
     pub(crate) fn pictures(self, of_all: &PictureArgs) -> anyhow::Result<Vec<PictureArgs>> {
         let (scenes, outputs) = (&of_all.scene.path, &of_all.output);
         ensure!(!of_all.scene.is_from_stdin(), "--frames needs files, not standard input");

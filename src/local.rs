@@ -20,8 +20,8 @@ use tokio_util::sync::CancellationToken;
 /// A picture that outlives this process is made safe from power cuts so often.
 const SYNC_PERIOD: Duration = Duration::from_secs(1);
 
-/// Renders what `canvas` lacks besides the tiles `done`. Answers how long the whole picture took, earlier
-/// processes included; `None` when `stop` came first. Never call this on the async runtime.
+/// Renders what `canvas` lacks besides the tiles `done`. Answers how long the whole picture took,
+/// earlier processes included; `None` when `stop` came first. Never call this on the async runtime.
 pub(crate) fn render(
     order: Order,
     canvas: &Canvas,
@@ -99,7 +99,8 @@ pub(crate) fn render(
     Ok(is_whole.then(elapsed))
 }
 
-/// Makes a canvas that outlives its process safe, unless that was done a moment ago or is being done.
+/// Makes a canvas that outlives its process safe, unless that was done a moment ago or is being
+/// done.
 fn sync_now_and_then(canvas: &Canvas, synced: &Mutex<Instant>) -> Result<(), PutError> {
     if canvas.is_kept()
         && let Ok(mut synced) = synced.try_lock()

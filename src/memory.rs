@@ -13,14 +13,15 @@ pub(crate) struct LargePages;
 const LARGE: usize = 8 << 20;
 
 impl LargePages {
-    /// Asks for large pages under a piece of memory. Whether there are any is the system's choice, and
-    /// nothing but time depends on it.
+    /// Asks for large pages under a piece of memory. Whether there are any is the system's choice,
+    /// and nothing but time depends on it.
     fn ask(piece: *mut u8, size: usize) -> *mut u8 {
         #[cfg(target_os = "linux")]
         if size >= LARGE && !piece.is_null() {
             const PAGE: usize = 4096;
             let before = piece.align_offset(PAGE);
-            // SAFETY: the pages lie in a piece that is allocated, and the advice changes no content.
+            // SAFETY: the pages lie in a piece that is allocated, and the advice changes no
+            // content.
             unsafe {
                 let whole = (size - before) / PAGE * PAGE;
                 libc::madvise(piece.add(before).cast(), whole, libc::MADV_HUGEPAGE);
@@ -58,12 +59,12 @@ unsafe impl GlobalAlloc for LargePages {
 const RETURNED: i32 = 1 << 20;
 
 /// Has large pieces of memory returned once they are freed. A scene that is read and prepared takes
-/// several times its size for a moment; glibc, which learns from the first pieces that are freed, would
-/// keep as much for as long as the picture takes.
+/// several times its size for a moment; glibc, which learns from the first pieces that are freed,
+/// would keep as much for as long as the picture takes.
 #[cfg(all(target_os = "linux", target_env = "gnu"))]
 pub(crate) fn return_what_is_freed() {
-    // SAFETY: `mallopt` takes two numbers and touches nothing that is allocated; this comes before other
-    // threads start.
+    // SAFETY: `mallopt` takes two numbers and touches nothing that is allocated; this comes before
+    // other threads start.
     unsafe { libc::mallopt(libc::M_MMAP_THRESHOLD, RETURNED) };
 }
 

@@ -23,9 +23,9 @@ const SIDE: u32 = 16;
 /// The part of the time that a prediction may take up: it is off by some per cent.
 const PART: f64 = 0.9;
 
-/// Chooses the finest of the [`adaptive_settings`] with which `threads` threads render the picture in
-/// `time`, what the choice itself takes included; the coarsest where none does. `None` when `stop`
-/// came first. Never call this on the async runtime.
+/// Chooses the finest of the [`adaptive_settings`] with which `threads` threads render the picture
+/// in `time`, what the choice itself takes included; the coarsest where none does. `None` when
+/// `stop` came first. Never call this on the async runtime.
 pub(crate) fn choose(
     order: &Order,
     (threads, isa): (usize, Isa),

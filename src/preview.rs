@@ -128,7 +128,8 @@ impl Painter {
         }
     }
 
-    /// Draws the picture if it is another than the one that was seen last. Answers with what is seen.
+    /// Draws the picture if it is another than the one that was seen last. Answers with what is
+    /// seen.
     fn paint_once(&self, seen: &[u8]) -> io::Result<Vec<u8>> {
         let view = Graphics::view(self.window);
         let pixels = (self.look)(view)?;

@@ -1,5 +1,5 @@
-//! A folder for what lives no longer than its process. A process that is killed cannot remove it; the
-//! next one that starts does.
+//! A folder for what lives no longer than its process. A process that is killed cannot remove it;
+//! the next one that starts does.
 
 use std::{
     fs::{self, File},
@@ -35,8 +35,8 @@ impl PrivateFolder {
         Self::with_prefix(parent, PREFIX)
     }
 
-    /// Makes one on a disk that machines share. Some disks do not show a lock to other machines, so that
-    /// each removes only what its own processes left.
+    /// Makes one on a disk that machines share. Some disks do not show a lock to other machines, so
+    /// that each removes only what its own processes left.
     pub(crate) fn new_for_many(parent: &Path) -> anyhow::Result<Self> {
         let host = uname().nodename().to_string_lossy().into_owned();
         Self::with_prefix(parent, &format!("rtfarm@{host}@"))

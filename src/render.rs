@@ -194,7 +194,8 @@ fn provenance(order: &Order) -> Provenance {
     }
 }
 
-/// Says whether a picture is in its place, with what stands beside it, and nothing of it is left to do.
+/// Says whether a picture is in its place, with what stands beside it, and nothing of it is left to
+/// do.
 fn is_there(output: &Output, wanted: &Provenance, has_sidecar: bool) -> bool {
     let is_whole = !Resume::folder(output).exists();
     let has_all = !has_sidecar || Making::path(output).exists();
@@ -284,10 +285,10 @@ impl Render<'_> {
         Ok(None)
     }
 
-    /// Renders pictures one after the other: while one is rendered the last is written, and the next is
-    /// prepared and handed to the workers, who turn to it when nothing else of this one is left to do.
-    /// The last picture is not written yet. The second result says what a picture failed of that could
-    /// not be begun; those before it are rendered all the same.
+    /// Renders pictures one after the other: while one is rendered the last is written, and the
+    /// next is prepared and handed to the workers, who turn to it when nothing else of this one is
+    /// left to do. The last picture is not written yet. The second result says what a picture
+    /// failed of that could not be begun; those before it are rendered all the same.
     async fn all_but_the_last(
         &self,
         first: Frame,

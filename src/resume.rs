@@ -1,5 +1,5 @@
-//! What an interrupted `rtfarm render --resume` leaves in a folder beside its picture, for the next one
-//! to go on with.
+//! What an interrupted `rtfarm render --resume` leaves in a folder beside its picture, for the next
+//! one to go on with.
 
 use std::{
     fs::{self, File},

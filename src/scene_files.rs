@@ -1,6 +1,6 @@
-//! The files that a scene names, and which of them may be read: regular ones that lie in the scene's
-//! folder once all links are resolved, or in a folder that the user allows besides. A scene may come
-//! from a stranger, and what it names may be sent to another machine.
+//! The files that a scene names, and which of them may be read: regular ones that lie in the
+//! scene's folder once all links are resolved, or in a folder that the user allows besides. A scene
+//! may come from a stranger, and what it names may be sent to another machine.
 
 use std::{
     fs::{self, File},
@@ -39,8 +39,8 @@ pub(crate) struct SceneFiles {
 }
 
 impl SceneFiles {
-    /// The files that stand beside the scene's own, or below; for a scene from standard input, those
-    /// in the current folder.
+    /// The files that stand beside the scene's own, or below; for a scene from standard input,
+    /// those in the current folder.
     pub(crate) fn new(scene: &SceneArgs) -> Self {
         let folder = if scene.is_from_stdin() { ".".into() } else { folder_of(&scene.path) };
         Self::in_folder(folder, scene.allow_files.clone())
@@ -50,8 +50,8 @@ impl SceneFiles {
         Self { folder, allowed, bytes_left: AtomicU64::new(MOST_BYTES) }
     }
 
-    /// Reads a file by the name that the scene has for it. Nothing that is no regular file is waited
-    /// for or read.
+    /// Reads a file by the name that the scene has for it. Nothing that is no regular file is
+    /// waited for or read.
     pub(crate) fn read(&self, name: &str) -> io::Result<Vec<u8>> {
         let mut file = self.open(name)?;
         let metadata = file.metadata()?;
@@ -89,7 +89,8 @@ impl SceneFiles {
         // Opening a pipe or a device must neither wait nor do anything to it.
         match open_beneath(&self.folder, Path::new(name), ResolveFlags::empty()) {
             Ok(file) => Ok(file),
-            // The name is absolute, or leads out of the folder, perhaps by a link: where to, matters.
+            // The name is absolute, or leads out of the folder, perhaps by a link: where to,
+            // matters.
             Err(Errno::XDEV) => self.open_where_it_leads(name),
             Err(errno) if is_unsupported(errno) => self.open_where_it_leads(name),
             Err(errno) => Err(errno.into()),

@@ -13,7 +13,8 @@ use tokio::net::TcpListener;
 
 use crate::console::Console;
 
-/// Serves the page on this machine and opens it, or says where it is. `folder` is this user's alone.
+/// Serves the page on this machine and opens it, or says where it is. `folder` is this user's
+/// alone.
 pub(crate) async fn show(
     coordinator: &Coordinator,
     folder: &Path,

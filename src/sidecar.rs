@@ -1,5 +1,6 @@
-//! The file beside a picture: what the picture's own file says of it, and what that must not say, so that
-//! its bytes are the same whoever rendered it: when that was, how long it took, on which hosts.
+//! The file beside a picture: what the picture's own file says of it, and what that must not say,
+//! so that its bytes are the same whoever rendered it: when that was, how long it took, on which
+//! hosts.
 
 use std::{
     collections::BTreeSet,

@@ -1,5 +1,5 @@
-//! `render --slurm`: workers that a cluster's Slurm starts, as the tasks of one array. They find the
-//! coordinator by an access file in a folder of the picture's disk, which the nodes must share.
+//! `render --slurm`: workers that a cluster's Slurm starts, as the tasks of one array. They find
+//! the coordinator by an access file in a folder of the picture's disk, which the nodes must share.
 
 use std::{
     env,

@@ -29,11 +29,11 @@ const MOST_PIXELS: [u32; 2] = [400, 300];
 /// What a character takes in pixels where the terminal does not say: hardly any takes less.
 const CELL: [u32; 2] = [6, 12];
 
-/// Asks for Kitty's graphics, how many colours a picture of sixels may have, and at last what the terminal
-/// can do, which each terminal answers.
+/// Asks for Kitty's graphics, how many colours a picture of sixels may have, and at last what the
+/// terminal can do, which each terminal answers.
 ///
-/// Source: K. Goyal, "Terminal graphics protocol", "Querying support"; E. Moy, S. Gildea, T. Dickey, "`XTerm`
-/// Control Sequences", "Set or request graphics attribute".
+/// Source: K. Goyal, "Terminal graphics protocol", "Querying support"; E. Moy, S. Gildea, T.
+/// Dickey, "`XTerm` Control Sequences", "Set or request graphics attribute".
 const QUESTION: &[u8] = b"\x1b_Gi=31,s=1,v=1,a=q,t=d,f=24;AAAA\x1b\\\x1b[?1;1;0S\x1b[c";
 
 /// Colours of a picture of sixels where the terminal does not say how many it has.
@@ -175,8 +175,8 @@ impl Room {
     }
 }
 
-/// What is known of a terminal by its variables: it shows pictures so, or shows none. Otherwise it must be
-/// asked.
+/// What is known of a terminal by its variables: it shows pictures so, or shows none. Otherwise it
+/// must be asked.
 fn known(variable: impl Fn(&str) -> Option<String>) -> Option<Found> {
     let value = |name| variable(name).unwrap_or_default();
     let term = value("TERM");
@@ -255,10 +255,11 @@ impl Drop for Asked {
     }
 }
 
-/// What a terminal shows pictures by, by all that it answered; `None` until it has. Its last answer is what
-/// it can do, where 4 stands for sixels.
+/// What a terminal shows pictures by, by all that it answered; `None` until it has. Its last answer
+/// is what it can do, where 4 stands for sixels.
 ///
-/// Source: Digital Equipment Corporation, "VT330/VT340 Programmer Reference Manual" (1987), "Primary DA".
+/// Source: Digital Equipment Corporation, "VT330/VT340 Programmer Reference Manual" (1987),
+/// "Primary DA".
 fn graphics(said: &[u8]) -> Option<Found> {
     let said = String::from_utf8_lossy(said);
     let answers = || said.split("\x1b[?").skip(1);

@@ -1,5 +1,5 @@
-//! `rtfarm verify`: whether a picture is what its scene gives. Tiles are rendered again, band by band, so
-//! that the picture's size is not limited by memory.
+//! `rtfarm verify`: whether a picture is what its scene gives. Tiles are rendered again, band by
+//! band, so that the picture's size is not limited by memory.
 
 use std::{
     fmt::Write as _,
@@ -211,7 +211,8 @@ fn prepare(
     })
 }
 
-/// Which of `count` tiles are rendered again: nobody who lacks the key knows before, unless all are.
+/// Which of `count` tiles are rendered again: nobody who lacks the key knows before, unless all
+/// are.
 fn choose(share: TileShare, count: u32, key: [u8; 32]) -> impl Fn(u32) -> bool + Sync {
     let wanted = match share {
         TileShare::All => count,

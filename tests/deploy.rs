@@ -152,8 +152,8 @@ fn units_are_started_by_systemd_as_they_are_and_come_back_when_they_are_killed()
     assert!(fs::read(place("here.png")).unwrap() == first);
 }
 
-/// The folder with the program that needs nothing of its system; `deploy/Containerfile` says how it is
-/// made.
+/// The folder with the program that needs nothing of its system; `deploy/Containerfile` says how it
+/// is made.
 fn static_program() -> Option<PathBuf> {
     let target = root().join("target/x86_64-unknown-linux-gnu/release");
     let is_there = target.join("rtfarm").exists();

@@ -1,4 +1,5 @@
-//! What a process ends with when it is given a file to read that it cannot use: 2, whatever the command.
+//! What a process ends with when it is given a file to read that it cannot use: 2, whatever the
+//! command.
 
 use std::{
     collections::BTreeSet,

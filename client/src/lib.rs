@@ -1,6 +1,6 @@
-//! A client of a farm: it orders a picture, waits for it and brings it. `submission` decides what is
-//! done next, a pure state machine with events in, actions out and time as an argument; [`run()`] does
-//! it, in surroundings that are handed in.
+//! A client of a farm: it orders a picture, waits for it and brings it. `submission` decides what
+//! is done next, a pure state machine with events in, actions out and time as an argument;
+//! [`run()`] does it, in surroundings that are handed in.
 
 mod plain;
 mod run;

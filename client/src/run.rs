@@ -52,8 +52,8 @@ pub trait Outside: Send {
     /// Warns the user that so many tiles had a second copy that differed from the first.
     fn warn_of_differing_tiles(&mut self, tiles: u32);
 
-    /// Writes the picture's pieces as they come; an empty one is the last. What was written is whole or
-    /// removed when this ends.
+    /// Writes the picture's pieces as they come; an empty one is the last. What was written is
+    /// whole or removed when this ends.
     fn write(
         &self,
         chunks: mpsc::Receiver<wire::Chunk>,

@@ -1,6 +1,7 @@
-//! A client's side of one job: it submits a scene, watches the job, fetches the picture and has
-//! the farm forget the job; a detached one ends when it knows its job. Decisions alone: what happens
-//! comes in as events with the time, what is to be done goes out as [`Action`]s, and nothing here waits.
+//! A client's side of one job: it submits a scene, watches the job, fetches the picture and has the
+//! farm forget the job; a detached one ends when it knows its job. Decisions alone: what happens
+//! comes in as events with the time, what is to be done goes out as [`Action`]s, and nothing here
+//! waits.
 
 use std::{
     collections::VecDeque,
@@ -11,8 +12,8 @@ use std::{
 use rtfarm_core::{render::Tally, tile::Size};
 use rtfarm_proto::{Address, JobId};
 
-/// What the shell is to do. All but [`Action::TellReport`], [`Action::Show`] and the warnings end what
-/// was being done before.
+/// What the shell is to do. All but [`Action::TellReport`], [`Action::Show`] and the warnings end
+/// what was being done before.
 #[derive(Debug)]
 pub(crate) enum Action {
     /// Reach the coordinator.
@@ -417,8 +418,8 @@ impl Submission {
         }
     }
 
-    /// Looks for a coordinator that is gone and may have the job, unless it was gone for too long. One
-    /// that keeps its jobs will have it.
+    /// Looks for a coordinator that is gone and may have the job, unless it was gone for too long.
+    /// One that keeps its jobs will have it.
     fn find_again(&mut self, job: Option<(JobId, Size)>, trouble: &Trouble, now: Instant) {
         let may_be_gone = matches!(
             trouble,

@@ -1,14 +1,15 @@
 //! What a coordinator carries: simulated workers that render nothing, each with its own connection
 //! over loopback, join at once and bring tiles of 16 x 16 pixels in time with a given rate.
 //!
-//! `cargo bench -p rtfarm-coordinator --bench load [-- WORKERS RATE TILES SECONDS FOLDER STATE SIDE]`
+//! `cargo bench -p rtfarm-coordinator --bench load [-- WORKERS RATE TILES SECONDS FOLDER STATE
+//! SIDE]`
 //!
-//! RATE is in tiles a second, over all workers; with 0 each worker brings its next tiles as soon as it
-//! has an answer. TILES of SIDE x SIDE pixels, 16 by default, come in one delivery. The picture is made in
-//! FOLDER; with STATE `second` or `tile` it outlives the coordinator, which is as safe when a tile is
-//! acknowledged as with `--state` and `--durable`. Latencies are from the
-//! moment when a delivery was to be sent to its answer, processor time is that of the coordinator and
-//! the simulated workers together.
+//! RATE is in tiles a second, over all workers; with 0 each worker brings its next tiles as soon as
+//! it has an answer. TILES of SIDE x SIDE pixels, 16 by default, come in one delivery. The picture
+//! is made in FOLDER; with STATE `second` or `tile` it outlives the coordinator, which is as safe
+//! when a tile is acknowledged as with `--state` and `--durable`. Latencies are from the moment
+//! when a delivery was to be sent to its answer, processor time is that of the coordinator and the
+//! simulated workers together.
 
 use std::{
     env,
@@ -193,7 +194,8 @@ async fn join(
     Ok((farm, member))
 }
 
-/// A worker's life, which ends after the time of the load. Answers with how long each delivery took.
+/// A worker's life, which ends after the time of the load. Answers with how long each delivery
+/// took.
 async fn work(
     number: u32,
     load: Load,

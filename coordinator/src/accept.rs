@@ -27,11 +27,11 @@ use tonic::transport::server::Connected;
 pub struct Limits {
     /// The longest that a handshake may take where there is TLS.
     pub handshake: Duration,
-    /// Whoever connects must have said something after this time, or have shown a token where one is
-    /// asked for.
+    /// Whoever connects must have said something after this time, or have shown a token where one
+    /// is asked for.
     pub first_word: Duration,
-    /// The most connections on which nobody has shown a token yet, where one is asked for. More wait to
-    /// be accepted.
+    /// The most connections on which nobody has shown a token yet, where one is asked for. More
+    /// wait to be accepted.
     pub strangers: usize,
 }
 
@@ -59,8 +59,8 @@ impl Peer {
         Self { is_local, place, is_cut_off: Arc::default() }
     }
 
-    /// Has its connection closed, when that is next looked at: in ten seconds at the latest, by which
-    /// connections show that they are alive.
+    /// Has its connection closed, when that is next looked at: in ten seconds at the latest, by
+    /// which connections show that they are alive.
     pub(crate) fn cut_off(&self) {
         self.is_cut_off.store(true, Ordering::Relaxed);
     }

@@ -1,5 +1,5 @@
-//! What happens on a farm, for machines: a JSON object each, in a file line by line, and the last of
-//! them for those who watch.
+//! What happens on a farm, for machines: a JSON object each, in a file line by line, and the last
+//! of them for those who watch.
 
 use std::{
     collections::{BTreeMap, VecDeque},
@@ -127,8 +127,8 @@ impl Events {
         }
     }
 
-    /// The last events but for finished tiles, the earliest first, without the first `seen` that there
-    /// were; and how many there were.
+    /// The last events but for finished tiles, the earliest first, without the first `seen` that
+    /// there were; and how many there were.
     pub(crate) fn since(&self, seen: u64) -> (Vec<Value>, u64) {
         let kept = self.kept.lock().expect("nothing here panics");
         let new = kept.events.len().min((kept.count - seen.min(kept.count)) as usize);

@@ -280,8 +280,8 @@ impl Farm {
         actions
     }
 
-    /// Event: a worker has pixels of these tiles of a job, which it rendered for an earlier start of
-    /// this farm. Those that are free are leased to it, as any tile is.
+    /// Event: a worker has pixels of these tiles of a job, which it rendered for an earlier start
+    /// of this farm. Those that are free are leased to it, as any tile is.
     pub(crate) fn on_offer(
         &mut self,
         worker: WorkerId,
@@ -357,8 +357,8 @@ impl Farm {
         self.waiting.iter().find_map(|(id, ask)| Some((id, ask, self.work_for(ask.worker, now)?)))
     }
 
-    /// What a worker that waits may begin: a tile to compare or free tiles of the first job that has
-    /// any, unless one before it has a tile that is overdue, or a suspect, for which the worker
+    /// What a worker that waits may begin: a tile to compare or free tiles of the first job that
+    /// has any, unless one before it has a tile that is overdue, or a suspect, for which the worker
     /// first finishes all else that it has.
     fn work_for(&self, worker: WorkerId, now: Instant) -> Option<Work> {
         if self.leases.is_on_trial(worker) {
@@ -456,8 +456,8 @@ impl Farm {
         actions
     }
 
-    /// Event: the coordinator is to stop. Workers are sent home, and every job that will not be there
-    /// again has ended.
+    /// Event: the coordinator is to stop. Workers are sent home, and every job that will not be
+    /// there again has ended.
     pub(crate) fn on_shut_down(&mut self, now: Instant) -> Vec<Action> {
         let mut actions = self.on_close();
         if !self.keeps_jobs {

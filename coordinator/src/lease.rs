@@ -17,8 +17,8 @@ use crate::{
     tiles::{Arrival, PixelHash, Place, Rendering, Tiles},
 };
 
-/// The longest run of tiles in one lease. Workers ask for as many as they render in a moment: a lost one
-/// costs no more than that.
+/// The longest run of tiles in one lease. Workers ask for as many as they render in a moment: a
+/// lost one costs no more than that.
 const LONGEST_RUN: usize = 1024;
 
 /// The longest run for each thread of a worker of which no tile of the job has come yet: nobody
@@ -40,10 +40,10 @@ const SHORTEST_QUIET: Duration = Duration::from_millis(20);
 pub(crate) const LONGEST_QUIET: Duration = Duration::from_millis(400);
 
 /// The leases of all jobs that are being rendered, and those jobs. Invariants: a lease holds at
-/// least one tile, and those that it holds alone or shares are open; each lease has one entry in `expiries`, `by_worker`
-/// and `by_job`, and one in its job's set in `quiet` exactly while it holds a tile alone that is under no
-/// suspicion; no set there is empty; `with_free` has exactly the jobs with a free tile, `with_suspects` those with a free
-/// tile under suspicion.
+/// least one tile, and those that it holds alone or shares are open; each lease has one entry in
+/// `expiries`, `by_worker` and `by_job`, and one in its job's set in `quiet` exactly while it holds
+/// a tile alone that is under no suspicion; no set there is empty; `with_free` has exactly the jobs
+/// with a free tile, `with_suspects` those with a free tile under suspicion.
 #[derive(Debug)]
 pub(crate) struct Leases {
     term: Duration,
@@ -55,7 +55,8 @@ pub(crate) struct Leases {
     with_suspects: BTreeSet<JobId>,
     held: BTreeMap<LeaseId, Lease>,
     expiries: BTreeSet<(Instant, LeaseId)>,
-    /// By the last tile. (How long it may be silent depends on its job, and changes with each tile.)
+    /// By the last tile. (How long it may be silent depends on its job, and changes with each
+    /// tile.)
     quiet: BTreeMap<JobId, BTreeSet<(Instant, LeaseId)>>,
     by_worker: BTreeSet<(WorkerId, LeaseId)>,
     by_job: BTreeSet<(JobId, LeaseId)>,
@@ -209,8 +210,8 @@ impl Leases {
         self.by_job.range(of_job).map(|(_, id)| self.held[id].worker).collect()
     }
 
-    /// The tiles of a job that workers have and have not brought, and whether they are known to have
-    /// begun them.
+    /// The tiles of a job that workers have and have not brought, and whether they are known to
+    /// have begun them.
     pub(crate) fn in_work(&self, job: JobId) -> impl Iterator<Item = (TileId, WorkerId, bool)> {
         let of_job = (job, LeaseId(0))..=(job, LeaseId(u64::MAX));
         let leases = self.by_job.range(of_job).map(|(_, id)| &self.held[id]);
@@ -313,8 +314,8 @@ impl Leases {
         Some(run)
     }
 
-    /// Event: `worker` has pixels of these tiles of `job`. It gets those that are free; `None` when none
-    /// is.
+    /// Event: `worker` has pixels of these tiles of `job`. It gets those that are free; `None` when
+    /// none is.
     pub(crate) fn on_offer(
         &mut self,
         (worker, threads): (WorkerId, usize),

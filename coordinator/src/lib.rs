@@ -3,9 +3,8 @@
 //!
 //! `farm` and what it is made of decide: time is an argument there, and nothing waits. `shell` runs
 //! that machine: it hands events to it and does what it answers, with the files of `store` and what
-//! it keeps of each `job`. `service` translates between gRPC and the shell, `page` shows a browser what `live` tells, and
-//! `run` serves. Each
-//! knows only what stands before it:
+//! it keeps of each `job`. `service` translates between gRPC and the shell, `page` shows a browser
+//! what `live` tells, and `run` serves. Each knows only what stands before it:
 //!
 //! ```text
 //! upload <- shell, service

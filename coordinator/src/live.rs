@@ -1,6 +1,6 @@
-//! What those see who watch a farm: a stream of messages a picture, each made once for all who watch
-//! it, and kept a while for those who come late or come again. Nobody who renders waits for them, and
-//! while nobody watches nothing is made.
+//! What those see who watch a farm: a stream of messages a picture, each made once for all who
+//! watch it, and kept a while for those who come late or come again. Nobody who renders waits for
+//! them, and while nobody watches nothing is made.
 
 use std::{
     collections::{BTreeMap, VecDeque},
@@ -30,11 +30,12 @@ const PERIOD: Duration = Duration::from_millis(100);
 /// Workers, jobs and tiles in work are shown after so many periods.
 const PERIODS_A_STATUS: u32 = 5;
 
-/// What was told is kept for those who lost their connection so many periods after the last has gone.
+/// What was told is kept for those who lost their connection so many periods after the last has
+/// gone.
 const PERIODS_OF_GRACE: u32 = 100;
 
-/// The most tiles in one message. Their pixels stand one below the other in one picture, which must not
-/// be too high.
+/// The most tiles in one message. Their pixels stand one below the other in one picture, which must
+/// not be too high.
 const MOST_TILES: usize = 128;
 
 /// The most bytes of messages that are kept. Who has seen fewer gets the whole picture.
@@ -204,7 +205,8 @@ impl Feed {
         Some(new)
     }
 
-    /// All that there is to know. This may read the whole picture: never call it on the async runtime.
+    /// All that there is to know. This may read the whole picture: never call it on the async
+    /// runtime.
     pub(crate) fn all(&self, shell: &Shell) -> io::Result<(Seen, Vec<Bytes>)> {
         let mut whole = self.whole.lock().expect("reading never panics");
         let (last, is_known) = {
@@ -318,8 +320,9 @@ impl Told {
     }
 }
 
-/// What a view shows of a job's picture: `[y][x]`, red, green and blue. Where no tile has come yet that is
-/// a coarse picture's, if one was begun. This reads the picture: never call it on the async runtime.
+/// What a view shows of a job's picture: `[y][x]`, red, green and blue. Where no tile has come yet
+/// that is a coarse picture's, if one was begun. This reads the picture: never call it on the async
+/// runtime.
 pub(crate) fn snapshot(shell: &Shell, job: &Job, view: View) -> io::Result<Vec<u8>> {
     // First which, then what they look like.
     let done = shell.done(job.id);

@@ -1,8 +1,8 @@
 //! What the machine alone costs, in farms of 10 and of 10,000 workers that all have tiles.
 //!
-//! `cargo test --release -p rtfarm-coordinator load -- --ignored --nocapture` prints events a second;
-//! `valgrind --tool=callgrind --toggle-collect='*::bring_and_ask'` before the test's program and one
-//! test's name counts the instructions of its 100,000 tiles.
+//! `cargo test --release -p rtfarm-coordinator load -- --ignored --nocapture` prints events a
+//! second; `valgrind --tool=callgrind --toggle-collect='*::bring_and_ask'` before the test's
+//! program and one test's name counts the instructions of its 100,000 tiles.
 
 use std::time::{Duration, Instant};
 

@@ -21,8 +21,8 @@ pub(crate) struct Process {
     pub(crate) memory: Option<u64>,
 }
 
-/// What a farm remembers of a process though it is no member: how it was found to be, or was told to
-/// work.
+/// What a farm remembers of a process though it is no member: how it was found to be, or was told
+/// to work.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Mark {
     /// It lied, as this worker, and is kept out.
@@ -256,7 +256,8 @@ impl Members {
         self.by_process.range(of_process).next().map(|&(_, worker)| worker)
     }
 
-    /// Says whether something is true of every active member that can hold a scene of so many bytes.
+    /// Says whether something is true of every active member that can hold a scene of so many
+    /// bytes.
     pub(crate) fn all(&self, bytes: u64, is_true: impl Fn(WorkerId) -> bool) -> bool {
         self.memories.range((bytes, WorkerId(0))..).all(|&(_, worker)| is_true(worker))
     }

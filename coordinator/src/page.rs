@@ -1,5 +1,5 @@
-//! The page on which a farm is watched, and figures for machines: what is served by HTTP besides the
-//! gRPC services, to be looked at only.
+//! The page on which a farm is watched, and figures for machines: what is served by HTTP besides
+//! the gRPC services, to be looked at only.
 
 use std::{
     convert::Infallible,
@@ -50,8 +50,8 @@ const MOST_VIEWERS: usize = 1024;
 /// Something is sent at least so often, so that both sides see that the other is there.
 const LONGEST_SILENCE: Duration = Duration::from_secs(15);
 
-/// What every answer says to the browser: load nothing from elsewhere, be part of no other page, take
-/// no text for markup, keep nothing.
+/// What every answer says to the browser: load nothing from elsewhere, be part of no other page,
+/// take no text for markup, keep nothing.
 const HEADERS: [(&str, &str); 7] = [
     (
         "content-security-policy",
@@ -134,8 +134,8 @@ impl Page {
         answer.unwrap_or_else(|(status, reason)| refused(status, reason))
     }
 
-    /// Says whether the browser knows the coordinator by a name that it has. Another one may be that of
-    /// somebody who wants to look through the eyes of the browser's user.
+    /// Says whether the browser knows the coordinator by a name that it has. Another one may be
+    /// that of somebody who wants to look through the eyes of the browser's user.
     fn is_host(&self, parts: &Parts) -> bool {
         let header = || parts.headers.get(HOST).and_then(|host| host.to_str().ok());
         let host = parts.uri.authority().map(Authority::as_str).or_else(header);
@@ -472,7 +472,8 @@ mod tests {
         let job = shell.submit_on(JobId(7), order, canvas, &[(tile, record)]).unwrap();
         let view = View::within(grid.window(), [171, 256]);
         assert_eq!(view.step(), 3);
-        // Of a coarse picture nothing has come yet, then all: its places are those of the whole one.
+        // Of a coarse picture nothing has come yet, then all: its places are those of the whole
+        // one.
         for [across, down] in [[0.0; 2], [1.0; 2]] {
             if across > 0.0 {
                 let coarse = shell.coarse(&job).unwrap();

@@ -95,7 +95,8 @@ pub(crate) struct Ticket {
     pub(crate) name: String,
     /// Who wants it.
     pub(crate) owner: String,
-    /// Whose budget it is in: the owner of the token that it was ordered by; empty if that has none.
+    /// Whose budget it is in: the owner of the token that it was ordered by; empty if that has
+    /// none.
     pub(crate) account: String,
     /// An order of the same account with the same key is for the same job; empty if none is.
     pub(crate) key: String,

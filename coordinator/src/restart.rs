@@ -1,5 +1,5 @@
-//! A coordinator with a state that is killed, or whose disk fails, at each change that it makes there;
-//! then the next one, on a good disk.
+//! A coordinator with a state that is killed, or whose disk fails, at each change that it makes
+//! there; then the next one, on a good disk.
 
 use std::{
     collections::BTreeMap,
@@ -167,8 +167,8 @@ async fn work(folder: &Path, disk: Disk, durability: Durability) -> Told {
     told
 }
 
-/// After the disk has failed at a change, a power cut takes every so many parts of what was not synced,
-/// if there is one.
+/// After the disk has failed at a change, a power cut takes every so many parts of what was not
+/// synced, if there is one.
 async fn check_at_every_change(
     disk_at: fn(u64) -> Disk,
     durability: Durability,

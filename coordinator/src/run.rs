@@ -83,8 +83,8 @@ impl Coordinator {
         self.shell.submit(order, ticket)
     }
 
-    /// Takes an order whose picture is `canvas`, cut as the order says; these tiles are in it already.
-    /// This writes files: never call it on the async runtime.
+    /// Takes an order whose picture is `canvas`, cut as the order says; these tiles are in it
+    /// already. This writes files: never call it on the async runtime.
     pub fn submit_on(
         &self,
         order: Order,
@@ -117,8 +117,9 @@ impl Coordinator {
         self.shell.close();
     }
 
-    /// What a view shows of a job's picture: `[y][x]`, red, green and blue. Where no tile has come yet that
-    /// is a coarse picture's, if jobs begin so. This reads the picture: never call it on the async runtime.
+    /// What a view shows of a job's picture: `[y][x]`, red, green and blue. Where no tile has come
+    /// yet that is a coarse picture's, if jobs begin so. This reads the picture: never call it on
+    /// the async runtime.
     pub fn snapshot(&self, job: &Job, view: View) -> io::Result<Vec<u8>> {
         live::snapshot(&self.shell, job, view)
     }
@@ -204,7 +205,8 @@ async fn serve(
     }
 }
 
-/// Has those who connect speak TLS, and hands on those who do in time, until nobody takes them any more.
+/// Has those who connect speak TLS, and hands on those who do in time, until nobody takes them any
+/// more.
 async fn shake_hands<S: AsyncRead + AsyncWrite + Unpin + Send + 'static>(
     mut connections: mpsc::Receiver<io::Result<Greeted<S>>>,
     tls: TlsAcceptor,
@@ -270,7 +272,8 @@ mod tests {
     use super::*;
     use crate::{farm::Keeping, security::make_certificates, upload::OrderLimits};
 
-    /// How a coordinator is reached, whose certificate is good to that day, who serves it, and its folder.
+    /// How a coordinator is reached, whose certificate is good to that day, who serves it, and its
+    /// folder.
     async fn start(
         last_day: (i32, u8, u8),
     ) -> (Access, JoinHandle<Result<(), ServeError>>, TempDir) {

@@ -252,8 +252,8 @@ struct Tokens {
 }
 
 impl Security {
-    /// Opens what a farm's state has, and makes what it lacks: an authority, a certificate, a token and
-    /// an access file for each role. `address` is where others find the coordinator.
+    /// Opens what a farm's state has, and makes what it lacks: an authority, a certificate, a token
+    /// and an access file for each role. `address` is where others find the coordinator.
     pub fn open(state: &Path, address: &Address) -> Result<Self, SecurityError> {
         let folder = state.join(FOLDER);
         if !folder.exists() {
@@ -291,8 +291,8 @@ impl Security {
         Ok(Self { folder, known: Mutex::new(known) })
     }
 
-    /// What the coordinator shows to those who connect: workers and clients speak HTTP/2, browsers that
-    /// or HTTP/1.1.
+    /// What the coordinator shows to those who connect: workers and clients speak HTTP/2, browsers
+    /// that or HTTP/1.1.
     pub(crate) fn tls(&self) -> io::Result<TlsAcceptor> {
         let pem = fs::read(self.folder.join(CERTIFICATE))?;
         let chain = CertificateDer::pem_slice_iter(&pem).collect::<Result<Vec<_>, _>>();
@@ -348,13 +348,14 @@ impl Security {
     }
 }
 
-/// Makes a new token and access file; the holder's old one is not taken any more. Answers with the file.
+/// Makes a new token and access file; the holder's old one is not taken any more. Answers with the
+/// file.
 pub fn renew_token(state: &Path, holder: &Holder) -> Result<PathBuf, SecurityError> {
     renew_in(&of_state(state)?, holder)
 }
 
-/// Has a token not taken any more, and removes its access file. Answers with the owners who have tokens
-/// of their own, which stay. It fails for an owner who has none.
+/// Has a token not taken any more, and removes its access file. Answers with the owners who have
+/// tokens of their own, which stay. It fails for an owner who has none.
 pub fn revoke_token(state: &Path, holder: &Holder) -> Result<Vec<Owner>, SecurityError> {
     let folder = of_state(state)?;
     let mut tokens = Tokens::read(&folder)?;
@@ -532,7 +533,8 @@ mod tests {
         tokio::time::advance(REREAD).await;
         assert_eq!(check(&security, submit, &renewed), Some(Code::Unauthenticated));
 
-        // The others are the same at the next start, and know the new address; the revoked stays so.
+        // The others are the same at the next start, and know the new address; the revoked stays
+        // so.
         let elsewhere: Address = "https://elsewhere:1".parse().unwrap();
         let again = Security::open(state.path(), &elsewhere).unwrap();
         let worker = access(state.path(), Role::Work);

@@ -33,7 +33,8 @@ use crate::{
 /// The longest message of a client: a piece of a scene, or of a file with its path.
 const PIECE_BYTES: usize = CHUNK_BYTES + (1 << 16);
 
-/// Both services over one coordinator and its page, for those who have a token if there is `security`.
+/// Both services over one coordinator and its page, for those who have a token if there is
+/// `security`.
 pub(crate) fn router(shell: &Arc<Shell>, security: Option<Arc<Security>>) -> Router {
     const WINDOW_BYTES: u32 = 1 << 22;
     // A frame of a delivery; each costs both sides a call of the system.

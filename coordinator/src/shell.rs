@@ -326,7 +326,8 @@ impl Shell {
                 }
             }
             Action::TakeBack(job, tiles) => {
-                // At once, though it writes: what comes of these tiles next must not be cleared. It is rare.
+                // At once, though it writes: what comes of these tiles next must not be cleared. It
+                // is rare.
                 if let Some(known) = state.jobs.get(&job)
                     && let Err(error) = known.canvas.clear(&tiles)
                 {
@@ -470,8 +471,8 @@ impl Shell {
         self.tell(|state, _| state.farm.on_call(Incarnation(incarnation)))
     }
 
-    /// Lets a client's call in that is meant for this farm. Who knows only the number of a job names
-    /// none.
+    /// Lets a client's call in that is meant for this farm. Who knows only the number of a job
+    /// names none.
     pub(crate) fn admit_client(&self, farm: &[u8]) -> Result<(), Stranger> {
         let Identity { farm: ours, incarnation } = self.identity;
         let is_ours = farm.is_empty() || farm == ours.0;
@@ -556,8 +557,8 @@ impl Shell {
         self.tell_farm(|farm, now| farm.on_process_exit(process, reason, now));
     }
 
-    /// Takes an order, or finds the job of an earlier one with the same key. This writes files: never
-    /// call it on the async runtime.
+    /// Takes an order, or finds the job of an earlier one with the same key. This writes files:
+    /// never call it on the async runtime.
     pub(crate) fn submit(&self, order: Order, ticket: Ticket) -> Result<Arc<Job>, SubmitError> {
         let _alone = self.changing.lock().expect("writing never panics");
         if let Some(job) = self.claim(&ticket)? {
@@ -584,8 +585,8 @@ impl Shell {
         Ok(job)
     }
 
-    /// The job that the account's earlier order with the same key has, which another client is told of
-    /// now. It fails if that order was another one.
+    /// The job that the account's earlier order with the same key has, which another client is told
+    /// of now. It fails if that order was another one.
     pub(crate) fn claim(&self, ticket: &Ticket) -> Result<Option<Arc<Job>>, SubmitError> {
         let Ticket { account, key, wanted, .. } = ticket;
         let has_key = |of: &Ticket| !key.is_empty() && (&of.account, &of.key) == (account, key);
@@ -641,8 +642,8 @@ impl Shell {
     }
 
     /// The job of a coarse picture of what another job renders, before all others: it is made when
-    /// there is none. Nobody is told of it but those who watch. This writes a file: never call it on
-    /// the async runtime.
+    /// there is none. Nobody is told of it but those who watch. This writes a file: never call it
+    /// on the async runtime.
     pub(crate) fn coarse(&self, of: &Arc<Job>) -> Option<Arc<Job>> {
         let id = coarse_id(of.id);
         if let Some(known) = self.job(id) {

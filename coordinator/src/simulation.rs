@@ -389,8 +389,8 @@ impl World {
         admitted.is_ok()
     }
 
-    /// The coordinator is killed and started anew: connections break, workers and their pixels stay. It
-    /// may have kept jobs and pictures, or they are gone.
+    /// The coordinator is killed and started anew: connections break, workers and their pixels
+    /// stay. It may have kept jobs and pictures, or they are gone.
     fn restart(&mut self) {
         self.restart_count += 1;
         let identity = identity(self.seed, self.restart_count);

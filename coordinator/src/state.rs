@@ -8,8 +8,8 @@
 //! jobs/12/picture, tiles    the pixels, and a record of each tile in it: a canvas
 //! ```
 //!
-//! Records are replaced whole. A job's folder gets its name when all in it is safe, and loses it before
-//! anything in it goes: one with another name than a number is what a killed process left.
+//! Records are replaced whole. A job's folder gets its name when all in it is safe, and loses it
+//! before anything in it goes: one with another name than a number is what a killed process left.
 
 use std::{
     collections::BTreeMap,
@@ -123,8 +123,9 @@ pub(crate) struct JobFolder {
 }
 
 impl StateFolder {
-    /// Opens the state in the folder `path`, which is made if there is none. Tiles that do not match
-    /// their records are not done. A job that another `build` began cannot be finished and has failed.
+    /// Opens the state in the folder `path`, which is made if there is none. Tiles that do not
+    /// match their records are not done. A job that another `build` began cannot be finished and
+    /// has failed.
     pub fn open(path: &Path, build: &str, durability: Durability) -> Result<Self, StateError> {
         Self::open_on(Disk::default(), path, build, durability)
     }
@@ -143,7 +144,8 @@ impl StateFolder {
         let names: Vec<_> = names.map_err(io)?.iter().map(fs::DirEntry::file_name).collect();
         let farm_path = path.join(FARM);
         let (is_known, jobs) = (farm_path.exists(), path.join(JOBS));
-        // Certificates may have been made before, and a file system of its own has a folder as well.
+        // Certificates may have been made before, and a file system of its own has a folder as
+        // well.
         let known = [LOCK, "farm.new", JOBS, "access", "lost+found"];
         if !is_known && names.iter().any(|name| !known.iter().any(|known| name == known)) {
             return Err(StateError::Foreign(path.to_owned()));

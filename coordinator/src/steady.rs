@@ -340,7 +340,8 @@ enum Event {
 }
 
 /// The time that a picture takes on so many workers of one thread: each measured tile stands for
-/// `side` x `side` that cost as much as it does. What the coordinator does it does one after the other.
+/// `side` x `side` that cost as much as it does. What the coordinator does it does one after the
+/// other.
 fn time_on(workers: usize, side: usize) -> (Duration, Duration) {
     let (columns, rows) = (20 * side, 15 * side);
     let cost = |tile: TileId| {

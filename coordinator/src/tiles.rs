@@ -26,9 +26,9 @@ pub(crate) struct Place(u32);
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Holders([Option<LeaseId>; 2]);
 
-/// Which tiles of a job are free, leased, being stored and done. Invariants: a tile moves from
-/// open to storing to done, and back only when its worker is known to lie; each open tile without holders is in exactly one of
-/// `free`, `suspects` and `aside`, by its losses.
+/// Which tiles of a job are free, leased, being stored and done. Invariants: a tile moves from open
+/// to storing to done, and back only when its worker is known to lie; each open tile without
+/// holders is in exactly one of `free`, `suspects` and `aside`, by its losses.
 #[derive(Debug)]
 pub(crate) struct Tiles {
     grid: TileGrid,
@@ -36,7 +36,8 @@ pub(crate) struct Tiles {
     order: Vec<TileId>,
     by_number: Vec<Tile>,
     free: BTreeSet<Place>,
-    /// Free tiles that may have been the end of a worker: each is rendered by one that has no other.
+    /// Free tiles that may have been the end of a worker: each is rendered by one that has no
+    /// other.
     suspects: BTreeSet<Place>,
     /// Tiles that nobody is to render any more.
     aside: BTreeSet<Place>,
@@ -203,8 +204,8 @@ impl Tiles {
         *self.losses.entry(place).or_default() += 1;
     }
 
-    /// Takes an open tile out of `lease`. When no other lease has it, it is free, or set aside after
-    /// too many losses; answers with that other lease.
+    /// Takes an open tile out of `lease`. When no other lease has it, it is free, or set aside
+    /// after too many losses; answers with that other lease.
     pub(crate) fn give_back(&mut self, place: Place, lease: LeaseId) -> Option<LeaseId> {
         let holders = self.holders_mut(place);
         holders.0 = holders.0.map(|holder| holder.filter(|&holder| holder != lease));
@@ -268,8 +269,8 @@ impl Tiles {
         }
     }
 
-    /// Frees every tile that is not in the picture, and those that are but are `wrong`. Nobody holds
-    /// any, or is to hold it.
+    /// Frees every tile that is not in the picture, and those that are but are `wrong`. Nobody
+    /// holds any, or is to hold it.
     pub(crate) fn reopen(&mut self, wrong: &BTreeSet<TileId>) {
         (self.suspects, self.aside, self.losses) = Default::default();
         for (&id, place) in self.order.iter().zip((0..).map(Place)) {

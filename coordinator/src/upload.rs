@@ -13,8 +13,8 @@ use std::{
     },
 };
 
-/// What is ordered may be so much: by each owner of a token, and by all others together. Who looks after
-/// the farm, with a token to do everything, may order more.
+/// What is ordered may be so much: by each owner of a token, and by all others together. Who looks
+/// after the farm, with a token to do everything, may order more.
 #[derive(Debug, Clone, Copy)]
 pub struct OrderLimits {
     /// Jobs that have not ended.

@@ -1,7 +1,7 @@
-//! A whole farm in one thread, under a clock and a network of its own: the real coordinator with its
-//! services and its state on disk, real workers, real clients, the bytes that they exchange. Only threads, wires and
-//! disks are played. A seed says all that happens; `RTFARM_SEED=7` repeats one, `RTFARM_FAULTS=1000000`
-//! goes on from seed to seed until so many faults were injected.
+//! A whole farm in one thread, under a clock and a network of its own: the real coordinator with
+//! its services and its state on disk, real workers, real clients, the bytes that they exchange.
+//! Only threads, wires and disks are played. A seed says all that happens; `RTFARM_SEED=7` repeats
+//! one, `RTFARM_FAULTS=1000000` goes on from seed to seed until so many faults were injected.
 
 use std::{
     collections::{BTreeMap, BTreeSet},
@@ -323,7 +323,8 @@ impl World {
         *until = (*until).max(Instant::now() + time);
     }
 
-    /// The clock of one host jumps ahead, or those of all: to it, it is as if all others had stood still.
+    /// The clock of one host jumps ahead, or those of all: to it, it is as if all others had stood
+    /// still.
     fn jump(&self) {
         let time = self.milliseconds_below(30_000);
         let jumping = self.below(self.hosts.len() as u64 + 1) as usize;
@@ -1004,7 +1005,8 @@ impl Totals {
     }
 }
 
-/// Lives through seeds, on all processors, until that is true of the totals and the number of seeds.
+/// Lives through seeds, on all processors, until that is true of the totals and the number of
+/// seeds.
 fn run_until(is_enough: impl Fn(&Totals, u64) -> bool + Sync) -> Totals {
     let totals = Mutex::new((Totals::default(), 0));
     let work = || loop {

@@ -57,7 +57,8 @@ impl Farm {
         Self::with(OrderLimits::default(), Duration::from_secs(60)).await
     }
 
-    /// With such limits, where who says nothing of a scene or takes nothing for that long is given up.
+    /// With such limits, where who says nothing of a scene or takes nothing for that long is given
+    /// up.
     async fn with(orders: OrderLimits, upload_silence: Duration) -> Self {
         let folder = tempfile::tempdir().unwrap();
         let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();

@@ -302,6 +302,7 @@ impl TileGrid {
 
     /// The same window in tiles of twice the side, unless they are above 64 pixels or fewer than 150
     /// then: where first samples are taken around a tile, too, larger ones need fewer of them.
+    #[must_use]
     pub fn with_less_rim(self) -> Self {
         let wider = Self { side: 2 * self.side, ..self };
         if wider.side <= 64 && wider.count() >= 150 { wider } else { self }

@@ -1,5 +1,5 @@
-//! What is rendered, whoever renders it: a request becomes an order with the scene's text, the order
-//! a job, which reports how far it is, tile by tile, until it ends.
+//! What is rendered, whoever renders it: a request becomes an order with the scene's text, the
+//! order a job, which reports how far it is, tile by tile, until it ends.
 //!
 //! A process that renders alone, a coordinator and its clients all speak of jobs in these words.
 

@@ -1,5 +1,6 @@
-//! What a picture's file says of its picture: all that it depends on, and how good it is. Nothing of who
-//! rendered it and when, so that a picture's bytes are the same whoever did. Lines of a word and a value.
+//! What a picture's file says of its picture: all that it depends on, and how good it is. Nothing
+//! of who rendered it and when, so that a picture's bytes are the same whoever did. Lines of a word
+//! and a value.
 
 use std::fmt::Write;
 
@@ -20,8 +21,8 @@ pub struct Provenance {
     pub scene: SceneHash,
     /// What the picture depends on besides.
     pub settings: Settings,
-    /// The frame, what of it the picture shows, and its tiles: no pixel depends on them, the number of
-    /// rays does.
+    /// The frame, what of it the picture shows, and its tiles: no pixel depends on them, the number
+    /// of rays does.
     pub grid: TileGrid,
     /// What the numbers of colours said of light.
     pub transfer: Transfer,

@@ -26,10 +26,11 @@ impl TileCosts {
         self.sums = [self.sums[0] + seconds, self.sums[1] + seconds * seconds];
     }
 
-    /// How long `tiles_left` tiles will take when these took `elapsed`; `None` before the second tile.
+    /// How long `tiles_left` tiles will take when these took `elapsed`; `None` before the second
+    /// tile.
     ///
-    /// The sum of m tiles drawn from those that n tiles were drawn from has the variance v (m + m^2 / n),
-    /// where v is that of one tile: they scatter, and their mean is not known better.
+    /// The sum of m tiles drawn from those that n tiles were drawn from has the variance v (m + m^2
+    /// / n), where v is that of one tile: they scatter, and their mean is not known better.
     pub fn time_left(&self, tiles_left: u32, elapsed: Duration) -> Option<TimeLeft> {
         let (done, left) = (f64::from(self.count), f64::from(tiles_left));
         let [sum, squares] = self.sums;
@@ -68,7 +69,8 @@ mod tests {
 
     #[test]
     fn the_error_is_that_of_what_comes_true() {
-        // Of many halves of jobs, how often does the second half lie within what the first half told?
+        // Of many halves of jobs, how often does the second half lie within what the first half
+        // told?
         let mut random = 1_u64;
         let mut cost = || {
             random = random.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1);

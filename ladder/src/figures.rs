@@ -53,8 +53,8 @@ pub struct Errors {
 }
 
 impl Errors {
-    /// Compares the linear pixels of a picture with the truth of its size. `asked` is the error that
-    /// was asked for.
+    /// Compares the linear pixels of a picture with the truth of its size. `asked` is the error
+    /// that was asked for.
     pub fn new(pixels: &[[f32; 3]], truth: &Truth, asked: Option<f64>) -> Self {
         let pairs: Vec<(f64, f64)> = (pixels.as_flattened().iter())
             .zip(truth.pixels.as_flattened())

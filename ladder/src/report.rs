@@ -23,8 +23,8 @@ pub struct Report {
 }
 
 impl Report {
-    /// The report on a user's scene. `wanted` is the error of its picture that is asked for, where 1
-    /// is full light; some are looked at when it is missing.
+    /// The report on a user's scene. `wanted` is the error of its picture that is asked for, where
+    /// 1 is full light; some are looked at when it is missing.
     pub fn on_scene(ladder: &Ladder, wanted: Option<StandardError>) -> Result<Self, PlotError> {
         let samples = ladder.reference.map_or(0, |reference| reference.samples.get());
         let text = [

@@ -58,7 +58,8 @@ pub struct TileRecord {
     pub tally: Tally,
     /// Time on one thread, in seconds.
     pub seconds: f32,
-    /// From the start of the rendering to this tile, in seconds in which a process was there for it.
+    /// From the start of the rendering to this tile, in seconds in which a process was there for
+    /// it.
     pub elapsed: f32,
     /// Workers that had brought tiles by then.
     pub worker_count: u32,
@@ -143,14 +144,15 @@ impl Canvas {
         self.records.is_some()
     }
 
-    /// The tiles in a picture that outlives its process. What does not match its record is not in it.
+    /// The tiles in a picture that outlives its process. What does not match its record is not in
+    /// it.
     pub fn done(&self) -> io::Result<Vec<(TileId, TileRecord)>> {
         let records = self.records.as_ref();
         records.map_or_else(|| Ok(Vec::new()), |records| records.read(self.grid, &self.picture))
     }
 
-    /// What the tiles took that are in the picture. They are summed by their numbers: floats that are
-    /// summed in another order give another sum.
+    /// What the tiles took that are in the picture. They are summed by their numbers: floats that
+    /// are summed in another order give another sum.
     pub fn tally(&self) -> io::Result<Tally> {
         let mut sum = Tally::default();
         if self.records.is_none() {
@@ -212,8 +214,8 @@ impl Canvas {
         Ok(records.write(recorded)?)
     }
 
-    /// Takes tiles out of the picture, which is black there then: what was put of them is not what it is
-    /// to show.
+    /// Takes tiles out of the picture, which is black there then: what was put of them is not what
+    /// it is to show.
     pub fn clear(&self, tiles: &[TileId]) -> Result<(), PutError> {
         if let Some(records) = &self.records {
             records.write(tiles.iter().map(|&tile| (tile, [0; RECORD_BYTES])).collect())?;
@@ -279,8 +281,8 @@ fn record_offset(number: u32) -> u64 {
 }
 
 impl TileRecord {
-    /// A record as it is stored: what it says, and at its end a hash of that and of the tile's pixels as
-    /// they are in the picture.
+    /// A record as it is stored: what it says, and at its end a hash of that and of the tile's
+    /// pixels as they are in the picture.
     fn to_bytes(self, key: &[u8; 32], tile: TileId, pixels: &[u8]) -> [u8; RECORD_BYTES] {
         let Self { arrived, tally, seconds, elapsed, worker_count } = self;
         let Tally { rays, samples, untraced, most_untraced, estimated, variance, capped } = tally;

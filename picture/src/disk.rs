@@ -12,15 +12,16 @@ use std::{
     },
 };
 
-/// Where pictures and records are kept. By default each change is made; one for tests fails some, and
-/// remembers what is not synced.
+/// Where pictures and records are kept. By default each change is made; one for tests fails some,
+/// and remembers what is not synced.
 #[derive(Debug, Clone, Default)]
 pub struct Disk {
     fault: Option<Arc<Fault>>,
     cache: Option<Cache>,
 }
 
-/// What a power cut may take, in the order in which it was written, for tests. A clone is the same one.
+/// What a power cut may take, in the order in which it was written, for tests. A clone is the same
+/// one.
 #[derive(Debug, Clone, Default)]
 pub struct Cache(Arc<Mutex<Vec<Unsynced>>>);
 
@@ -28,7 +29,8 @@ pub struct Cache(Arc<Mutex<Vec<Unsynced>>>);
 enum Unsynced {
     /// A part of a file, within a sector, and what was there before.
     Part { file: Arc<File>, id: FileId, offset: u64, before: Vec<u8> },
-    /// A name, the one that the file had before, and the bytes of the file that had the name before.
+    /// A name, the one that the file had before, and the bytes of the file that had the name
+    /// before.
     Name { from: PathBuf, to: PathBuf, before: Option<Vec<u8>> },
 }
 
@@ -79,8 +81,8 @@ impl Disk {
         Self { cache: Some(cache.clone()), ..self }
     }
 
-    /// Stops a test's disk now, unless it makes every change: what its killed process does later has no
-    /// effect.
+    /// Stops a test's disk now, unless it makes every change: what its killed process does later
+    /// has no effect.
     pub fn stop(&self) {
         if let Some(fault) = &self.fault {
             fault.made.store(fault.at + 1, Ordering::SeqCst);

@@ -1,6 +1,6 @@
 //! A picture in a file: tiles are put into it in any order and from any thread, then it is encoded
-//! as a PNG or an `OpenEXR`, band by band, so that its size is not limited by memory. A [`Canvas`] may
-//! outlive its process, and says then which tiles are in it. A [`View`] shows one under way.
+//! as a PNG or an `OpenEXR`, band by band, so that its size is not limited by memory. A [`Canvas`]
+//! may outlive its process, and says then which tiles are in it. A [`View`] shows one under way.
 
 mod canvas;
 mod disk;

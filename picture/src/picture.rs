@@ -44,7 +44,8 @@ pub enum PutError {
     Io(#[from] io::Error),
 }
 
-/// What a picture's file says of it besides its pixels. Texts are ASCII; an empty one is not written.
+/// What a picture's file says of it besides its pixels. Texts are ASCII; an empty one is not
+/// written.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Notes {
     /// What made it.
@@ -201,9 +202,8 @@ impl Picture {
         self.disk.sync(&self.file)
     }
 
-    /// Writes the whole picture as a file of its format, which says `notes`. The same picture with the same
-    /// notes gives the same bytes.
-    /// A few bands of rows are in memory at a time.
+    /// Writes the whole picture as a file of its format, which says `notes`. The same picture with
+    /// the same notes gives the same bytes. A few bands of rows are in memory at a time.
     pub fn encode(&self, notes: &Notes, out: impl Write + Seek) -> io::Result<()> {
         match self.format {
             PictureFormat::Png8 => png::encode(self, notes, BitDepth::Eight, out),

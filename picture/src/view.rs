@@ -1,5 +1,5 @@
-//! A picture under way as a screen shows it: eight bits a channel, and pixels left out where there are
-//! too many.
+//! A picture under way as a screen shows it: eight bits a channel, and pixels left out where there
+//! are too many.
 
 use std::io;
 
@@ -30,8 +30,8 @@ impl View {
         Self { window, step }
     }
 
-    /// The view of a picture of that window which shows as much as fits into so many pixels across and
-    /// down, both at least 1.
+    /// The view of a picture of that window which shows as much as fits into so many pixels across
+    /// and down, both at least 1.
     pub fn within(window: Area, [across, down]: [u32; 2]) -> Self {
         Self { window, step: window.width().div_ceil(across).max(window.height().div_ceil(down)) }
     }
@@ -48,8 +48,8 @@ impl View {
         Size::new(side(window.width()), side(window.height())).expect("it is no larger")
     }
 
-    /// Encodes what the view shows of these areas of the picture, one below the other, as a PNG; empty
-    /// where it shows nothing of them.
+    /// Encodes what the view shows of these areas of the picture, one below the other, as a PNG;
+    /// empty where it shows nothing of them.
     pub fn encode(self, picture: &Picture, areas: &[Area]) -> io::Result<Vec<u8>> {
         let (mut width, mut rows) = (0, Vec::new());
         for &area in areas {
@@ -69,8 +69,8 @@ impl View {
         encode_screen(&bytes, width as u32 / 3)
     }
 
-    /// What the view shows of the whole picture: `[y][x]`, red, green and blue. Only the rows that are
-    /// shown are read.
+    /// What the view shows of the whole picture: `[y][x]`, red, green and blue. Only the rows that
+    /// are shown are read.
     pub fn pixels(self, picture: &Picture) -> io::Result<Vec<u8>> {
         let rows: Vec<Vec<u8>> = self.rows(picture, self.window).collect::<io::Result<_>>()?;
         Ok(rows.concat())

@@ -1,5 +1,5 @@
-//! How a coordinator is reached by those who may: its address, the authority that vouches for it, and a
-//! token that says what the caller may do. An access file has all three.
+//! How a coordinator is reached by those who may: its address, the authority that vouches for it,
+//! and a token that says what the caller may do. An access file has all three.
 
 use std::{
     error::Error,
@@ -21,8 +21,8 @@ use tonic::{
 
 use crate::Address;
 
-/// The name in every coordinator's certificate: the farm's own authority is what is trusted, whatever
-/// the address.
+/// The name in every coordinator's certificate: the farm's own authority is what is trusted,
+/// whatever the address.
 pub const CERTIFIED_NAME: &str = "rtfarm";
 
 /// What an access file begins with.
@@ -119,8 +119,8 @@ impl Access {
         Self { address, ..self }
     }
 
-    /// The same, and wherever this access file says that the coordinator is when a connection is made: it
-    /// may come back elsewhere.
+    /// The same, and wherever this access file says that the coordinator is when a connection is
+    /// made: it may come back elsewhere.
     #[must_use]
     pub fn kept_in(self, file: PathBuf) -> Self {
         Self { file: Some(file), ..self }

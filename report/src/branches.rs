@@ -16,8 +16,8 @@ use rtfarm_ladder::figures::{mean_and_band, median};
 
 use crate::kernels::now;
 
-/// The weight down to which trees are the truth: what is lighter is less than a thousandth of a step
-/// of 8 bits where a branch in two ends.
+/// The weight down to which trees are the truth: what is lighter is less than a thousandth of a
+/// step of 8 bits where a branch in two ends.
 const TRUTH: f64 = 1.0 / 1_048_576.0;
 
 /// The weights down to which trees are measured. That of roulette is 1/256.

@@ -1,7 +1,8 @@
 //! The report on speed and accuracy: pictures with closed forms, so that the error is the true one,
 //! and rays through a closed mesh, beside what other programs made of the same.
 //!
-//! `cargo run --release -p rtfarm-report -- --out DIR`; on a user's own scene, `rtfarm report SCENE`.
+//! `cargo run --release -p rtfarm-report -- --out DIR`; on a user's own scene, `rtfarm report
+//! SCENE`.
 
 mod branches;
 mod kernels;

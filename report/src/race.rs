@@ -39,8 +39,8 @@ const RACE: &str = "race.tsv";
 const BUILD: &str = "build";
 const OURS: &str = "rtfarm";
 
-/// A ray as it stands in a file: start, direction, reach, and how far its hit is at most if it does not
-/// leak.
+/// A ray as it stands in a file: start, direction, reach, and how far its hit is at most if it does
+/// not leak.
 type RaceRay = [f32; 8];
 
 /// Triangles along an edge of the octahedron, and pixels across and down, of each race.
@@ -70,8 +70,9 @@ pub(crate) fn write(folder: &Path, amount: Amount) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// The rays of each class: from the eye through the middles of pixels in blocks of 8 x 8, none of which
-/// misses the mesh; from what they meet to a light that half of it sees; from inside the mesh anywhere.
+/// The rays of each class: from the eye through the middles of pixels in blocks of 8 x 8, none of
+/// which misses the mesh; from what they meet to a light that half of it sees; from inside the mesh
+/// anywhere.
 fn rays(mesh: &Mesh, [width, height]: [u32; 2]) -> [(&'static str, Vec<RaceRay>); 3] {
     let scene = prepared(&visible(&mesh.triangles));
     let single = |v: DVec3| v.as_vec3().as_dvec3();
@@ -119,8 +120,8 @@ fn race_ray(origin: DVec3, direction: DVec3, reach: f64, most: f64) -> RaceRay {
     [x, y, z, dx, dy, dz, reach as f32, most as f32]
 }
 
-/// Follows the orders on standard input, which `tests/peers/embree.c` tells. The build is that of the
-/// hierarchy alone; a third number is the time of all that preparing a scene is.
+/// Follows the orders on standard input, which `tests/peers/embree.c` tells. The build is that of
+/// the hierarchy alone; a third number is the time of all that preparing a scene is.
 pub(crate) fn serve(folder: &Path, isa: Isa) -> anyhow::Result<()> {
     let mut lines = io::stdin().lock().lines();
     let mut next = || lines.next().transpose();

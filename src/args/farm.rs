@@ -32,7 +32,8 @@ pub(crate) struct CertsArgs {
 
 #[derive(Debug, ClapArgs)]
 pub(crate) struct TokensArgs {
-    /// Renew makes a new token and access file, and the old one is not taken any more; revoke only that.
+    /// Renew makes a new token and access file, and the old one is not taken any more; revoke only
+    /// that.
     #[arg(value_name = "renew|revoke")]
     pub(crate) change: TokenChange,
 
@@ -71,14 +72,16 @@ pub(crate) struct CoordinatorArgs {
     #[arg(long, env = "RTFARM_INSECURE")]
     pub(crate) insecure: bool,
 
-    /// Keep the farm's jobs and pictures in this folder, which is made if there is none: a coordinator
-    /// that is started on it again goes on with them. Without it they end with the coordinator.
+    /// Keep the farm's jobs and pictures in this folder, which is made if there is none: a
+    /// coordinator that is started on it again goes on with them. Without it they end with the
+    /// coordinator.
     ///
     /// DIR/access has the farm's certificates, and an access file for each role.
     #[arg(long, value_name = "DIR", env = "RTFARM_STATE")]
     pub(crate) state: Option<PathBuf>,
 
-    /// Lose no finished tile in a power cut; otherwise those of the last second may be rendered again.
+    /// Lose no finished tile in a power cut; otherwise those of the last second may be rendered
+    /// again.
     #[arg(long, requires = "state", env = "RTFARM_DURABLE")]
     pub(crate) durable: bool,
 
@@ -86,8 +89,8 @@ pub(crate) struct CoordinatorArgs {
     #[arg(long, value_name = "FILE", env = "RTFARM_EVENTS", help_heading = TALK)]
     pub(crate) events: Option<PathBuf>,
 
-    /// Where others find the coordinator, for the access files and the page; by default this machine's name, or the
-    /// address that is listened on.
+    /// Where others find the coordinator, for the access files and the page; by default this
+    /// machine's name, or the address that is listened on.
     #[arg(long, value_name = "HOST", env = "RTFARM_NAME", help_heading = LIMITS)]
     pub(crate) name: Option<String>,
 
@@ -103,7 +106,8 @@ pub(crate) struct CoordinatorArgs {
     #[arg(long, value_name = "N", default_value = "64", value_parser = whole_number::<u16>(1..=u16::MAX), env = "RTFARM_STRANGERS", help_heading = LIMITS)]
     strangers: u16,
 
-    /// Who sends nothing of a scene or takes nothing of one or of a picture for this long is given up.
+    /// Who sends nothing of a scene or takes nothing of one or of a picture for this long is given
+    /// up.
     #[arg(long, value_name = "S", default_value = "30", value_parser = parse_seconds, env = "RTFARM_UPLOAD_SECONDS", help_heading = LIMITS)]
     pub(crate) upload_seconds: Duration,
 
@@ -111,13 +115,13 @@ pub(crate) struct CoordinatorArgs {
     #[arg(long, value_name = "GB", default_value = "8", value_parser = parse_gigabytes, env = "RTFARM_UPLOAD_GB", help_heading = LIMITS)]
     upload_gb: u64,
 
-    /// The most bytes, in MB, of pixels, scenes and pictures that are in memory on their way here, and as
-    /// many on their way elsewhere; what more there is waits.
+    /// The most bytes, in MB, of pixels, scenes and pictures that are in memory on their way here,
+    /// and as many on their way elsewhere; what more there is waits.
     #[arg(long, value_name = "MB", default_value = "1000", value_parser = whole_number::<u32>(16..=u32::MAX), env = "RTFARM_FLIGHT_MB", help_heading = LIMITS)]
     flight_mb: u32,
 
-    /// The most jobs that have not ended, of each owner of a token and of all others together; who has the
-    /// token `admin` may order more, also of the next two.
+    /// The most jobs that have not ended, of each owner of a token and of all others together; who
+    /// has the token `admin` may order more, also of the next two.
     #[arg(long, value_name = "N", default_value = "1000", env = "RTFARM_MOST_JOBS", help_heading = LIMITS)]
     most_jobs: u64,
 
@@ -194,12 +198,13 @@ pub(crate) struct WorkerArgs {
 /// Which farm is meant, and how it is reached.
 #[derive(Debug, Clone, ClapArgs)]
 pub(crate) struct AccessArgs {
-    /// Where the coordinator is: `https://host:7878` or `unix:/path/socket`, `http://` if it is insecure;
-    /// by default where the access file says.
+    /// Where the coordinator is: `https://host:7878` or `unix:/path/socket`, `http://` if it is
+    /// insecure; by default where the access file says.
     #[arg(long = "coordinator", value_name = "URL", env = "RTFARM_COORDINATOR", help_heading = FARM)]
     address: Option<Address>,
 
-    /// The access file, which says where the coordinator is, who vouches for it, and what it is shown.
+    /// The access file, which says where the coordinator is, who vouches for it, and what it is
+    /// shown.
     #[arg(long, value_name = "FILE", env = "RTFARM_ACCESS", help_heading = FARM)]
     access: Option<PathBuf>,
 }
@@ -220,7 +225,8 @@ impl AccessArgs {
         };
         let read = || -> anyhow::Result<Access> {
             let metadata = fs::metadata(path)?;
-            // Who gave another's file for this user to read knows what they do: a Kubernetes secret is so.
+            // Who gave another's file for this user to read knows what they do: a Kubernetes secret
+            // is so.
             let is_own = metadata.uid() == rustix::process::geteuid().as_raw();
             let for_others = metadata.mode() & if is_own { 0o077 } else { 0o007 };
             ensure!(for_others == 0, "others may read it; chmod 600 makes it yours alone");

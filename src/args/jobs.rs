@@ -20,8 +20,8 @@ pub(crate) struct SubmitArgs {
     #[command(flatten)]
     pub(crate) coordinator: AccessArgs,
 
-    /// Print the job's number and end: the job goes on by itself, and `rtfarm image` fetches what -o
-    /// says. Otherwise an interruption cancels it.
+    /// Print the job's number and end: the job goes on by itself, and `rtfarm image` fetches what
+    /// -o says. Otherwise an interruption cancels it.
     #[arg(long, conflicts_with = "sidecar", help_heading = FARM)]
     pub(crate) detach: bool,
 
@@ -33,7 +33,8 @@ pub(crate) struct SubmitArgs {
     #[arg(long, value_name = "OWNER", env = "RTFARM_OWNER", help_heading = FARM)]
     pub(crate) owner: Option<Owner>,
 
-    /// Submit only once under this key: the job that the same order has already is taken for this one.
+    /// Submit only once under this key: the job that the same order has already is taken for this
+    /// one.
     #[arg(long, value_name = "KEY", value_parser = NonEmptyStringValueParser::new(), help_heading = FARM)]
     pub(crate) key: Option<String>,
 

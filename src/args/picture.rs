@@ -38,7 +38,8 @@ pub(crate) struct SettingArgs {
     #[arg(long, value_name = "N", value_parser = parse_samples, conflicts_with_all = ["error", "max_samples"], help_heading = PICTURE)]
     samples: Option<SampleCount>,
 
-    /// Sample each pixel until its standard error is below this, where 1 is full light [default: 1/255].
+    /// Sample each pixel until its standard error is below this, where 1 is full light [default:
+    /// 1/255].
     ///
     /// It is an error of light, not of encoded values, whatever the --transfer.
     #[arg(long, value_name = "ERROR", value_parser = parse_error, help_heading = PICTURE)]
@@ -60,14 +61,16 @@ pub(crate) struct SettingArgs {
     #[arg(long, value_name = "on|off", hide_possible_values = true, help_heading = PICTURE)]
     secondary: Option<Switch>,
 
-    /// The side of a tile in pixels; by default the one that gives about 1000 tiles, or 150 at least.
+    /// The side of a tile in pixels; by default the one that gives about 1000 tiles, or 150 at
+    /// least.
     #[arg(long, value_name = "N", value_parser = whole_number(TileGrid::SIDES), help_heading = PICTURE)]
     tile: Option<u64>,
 
-    /// What the numbers of colours say: the light itself, or light encoded by the sRGB curve [default: none].
+    /// What the numbers of colours say: the light itself, or light encoded by the sRGB curve
+    /// [default: none].
     ///
-    /// Then colours of materials, textures, point lights and the background are decoded, and a PNG is
-    /// encoded; an EXR holds light.
+    /// Then colours of materials, textures, point lights and the background are decoded, and a PNG
+    /// is encoded; an EXR holds light.
     #[arg(long, value_name = "none|srgb", value_parser = parse_transfer, help_heading = PICTURE)]
     transfer: Option<Transfer>,
 
@@ -91,8 +94,9 @@ pub(crate) struct PictureArgs {
 
     /// Prepare the scene to take little memory; pictures are the same.
     ///
-    /// A triangle takes some 32 bytes instead of 55; 38 if single precision does not hold its corners
-    /// exactly, as it does those of binary meshes. To prepare it takes as much memory as before.
+    /// A triangle takes some 32 bytes instead of 55; 38 if single precision does not hold its
+    /// corners exactly, as it does those of binary meshes. To prepare it takes as much memory as
+    /// before.
     #[arg(long, help_heading = WORK)]
     pub(crate) compact: bool,
 
@@ -152,8 +156,8 @@ pub(crate) fn form(is_compact: bool) -> Form {
 }
 
 impl SettingArgs {
-    /// What is said of a picture, as the options that say it and as a picture's file has it: words and
-    /// their values.
+    /// What is said of a picture, as the options that say it and as a picture's file has it: words
+    /// and their values.
     pub(crate) fn said(&self) -> Vec<(&'static str, &'static str, String)> {
         let Self { size, crop, samples, error, max_samples, .. } = self;
         let Self { seed, flat, secondary, tile, transfer, depth, .. } = self;

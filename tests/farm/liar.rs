@@ -26,9 +26,9 @@ fn introduction() -> wire::JoinRequest {
     }
 }
 
-/// Joins, and brings grey tiles with the right hashes until nobody wants them any more. Answers with how
-/// many were taken, and why it was refused in the end. Once some were taken it waits until others are there,
-/// who know better: alone it would finish the picture.
+/// Joins, and brings grey tiles with the right hashes until nobody wants them any more. Answers
+/// with how many were taken, and why it was refused in the end. Once some were taken it waits until
+/// others are there, who know better: alone it would finish the picture.
 async fn lie(url: &str, others: oneshot::Receiver<()>) -> (usize, tonic::Status) {
     let mut others = Some(others);
     let address: Address = url.parse().unwrap();

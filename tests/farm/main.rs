@@ -205,7 +205,8 @@ impl Process {
     }
 }
 
-/// An address that a coordinator may come back to: the system gives its port to nobody who asks for any.
+/// An address that a coordinator may come back to: the system gives its port to nobody who asks for
+/// any.
 fn own_address() -> String {
     static NEXT: AtomicU32 = AtomicU32::new(0);
     let range = fs::read_to_string("/proc/sys/net/ipv4/ip_local_port_range").unwrap();
@@ -341,7 +342,8 @@ fn a_killed_and_a_stopped_worker_change_nothing() {
     let workers = render.workers();
     kill_process(pid(workers[0].1), Signal::KILL).unwrap();
     kill_process(pid(workers[1].1), Signal::STOP).unwrap();
-    // The others stand still as well until that one is found out, or they might have done all by then.
+    // The others stand still as well until that one is found out, or they might have done all by
+    // then.
     let mut resting = BTreeSet::from([workers[0].1, workers[1].1]);
     poll(|| {
         for (_, process) in render.workers() {

@@ -86,7 +86,8 @@ impl Terminal {
         Self { inside, reading }
     }
 
-    /// Renders in it with these variables and options; answers with what it was told, and the picture's file.
+    /// Renders in it with these variables and options; answers with what it was told, and the
+    /// picture's file.
     fn render(self, variables: &[(&str, &str)], options: &[&str]) -> (String, RgbImage) {
         let Self { inside, reading } = self;
         let place = Place::new();

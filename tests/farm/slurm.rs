@@ -138,8 +138,8 @@ fn slurm_renders_the_same_bytes_though_tasks_are_cancelled_queued_again_preempte
 fn a_worker_that_slurm_asks_to_end_delivers_what_it_has() {
     let Some(cluster) = Cluster::start() else { return };
     let place = Place::new();
-    // Asked for by hand, and by the signal that Slurm sends before a task's time is over: that is a minute
-    // at least, and it comes 55 s before its end, be the worker there yet or not.
+    // Asked for by hand, and by the signal that Slurm sends before a task's time is over: that is a
+    // minute at least, and it comes 55 s before its end, be the worker there yet or not.
     for (job, options, by_hand) in
         [("1", "--array=1-1", true), ("2", "--array=1-1 --time=1 --signal=B:TERM@55", false)]
     {

@@ -80,8 +80,8 @@ fn a_picture_is_verified_with_another_instruction_set_and_what_was_changed_is_fo
     assert!(code == Some(1) && said.contains("the scene differs"), "{said}");
 }
 
-/// What stands beside a picture says the same as its file, and on how many workers of this host it was
-/// rendered.
+/// What stands beside a picture says the same as its file, and on how many workers of this host it
+/// was rendered.
 pub(super) fn check_sidecar(place: &Place, picture: &str, workers: u64) {
     let text = fs::read_to_string(place.path(&format!("{picture}.json"))).unwrap();
     let told: serde_json::Value = serde_json::from_str(&text).unwrap();

@@ -21,7 +21,8 @@ pub(crate) enum Call {
     Connect,
     /// Makes this process a member.
     Join,
-    /// Asks for tiles, first of all for those that are `kept`; the answer may take as long as `wait`.
+    /// Asks for tiles, first of all for those that are `kept`; the answer may take as long as
+    /// `wait`.
     Lease { member: Membership, most_tiles: usize, wait: Duration, kept: Option<KeptTiles> },
     /// Proves progress under leases.
     Renew { member: Membership, renewals: Vec<Renewal> },

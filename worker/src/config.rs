@@ -18,8 +18,8 @@ pub struct Config {
     pub version: String,
     /// Of the sources that pixels depend on; likewise.
     pub build: String,
-    /// What [`crate::reference()`] makes of the instruction set; none where the coordinator does not
-    /// ask for it.
+    /// What [`crate::reference()`] makes of the instruction set; none where the coordinator does
+    /// not ask for it.
     pub reference: Option<[u8; 32]>,
     /// Bytes that prepared scenes may have here together, those of tiles in work and those that are
     /// kept; `None`: any scene is taken, and none kept that is not needed.

@@ -1,13 +1,13 @@
-//! How much memory there is for this process: what the machine has, or less where its control groups
-//! allow less.
+//! How much memory there is for this process: what the machine has, or less where its control
+//! groups allow less.
 
 use std::{fs, path::Path};
 
 /// Of the memory that there is, this is left to pixels, threads and everybody else.
 const MARGIN: u64 = 4;
 
-/// Bytes that prepared scenes may have here together: three quarters of what there is. `None` when the
-/// system does not tell.
+/// Bytes that prepared scenes may have here together: three quarters of what there is. `None` when
+/// the system does not tell.
 pub fn memory_for_scenes() -> Option<u64> {
     let read = |path: &Path| fs::read_to_string(path).ok();
     let there_is = memory(&read)?;

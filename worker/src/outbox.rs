@@ -9,8 +9,8 @@ use tokio::{
 
 use crate::task::{Rendered, TURN};
 
-/// Tiles that the threads are done with. They wait for each other for a turn at most, and for nobody
-/// when a thread is about to have nothing to do.
+/// Tiles that the threads are done with. They wait for each other for a turn at most, and for
+/// nobody when a thread is about to have nothing to do.
 #[derive(Debug)]
 pub(crate) struct Outbox {
     threads: usize,

@@ -57,8 +57,8 @@ impl From<Status> for SceneError {
 }
 
 /// Brings the scene of a job here. Every sign of progress is a `beat`; neither a connection nor a
-/// piece of the scene may take longer than `silence`. Only a coordinator that is certainly on this machine,
-/// `is_local`, can know where the scene is here.
+/// piece of the scene may take longer than `silence`. Only a coordinator that is certainly on this
+/// machine, `is_local`, can know where the scene is here.
 pub(crate) async fn bring<C: Connection>(
     job: &Job,
     is_local: bool,

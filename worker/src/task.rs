@@ -98,8 +98,8 @@ pub(crate) struct GivenUp {
 
 impl Tasks {
     /// Nothing is under way. Calls that fail for want of an answer are repeated with growing
-    /// delays, which `seed` shuffles, until these would add up to more than `patience`, or the first
-    /// of them that has had no answer since the last to any call was made so long ago.
+    /// delays, which `seed` shuffles, until these would add up to more than `patience`, or the
+    /// first of them that has had no answer since the last to any call was made so long ago.
     pub(crate) fn new(patience: Duration, seed: u64) -> Self {
         Self {
             patience,
@@ -148,8 +148,8 @@ impl Tasks {
         self.timers.insert((deadline, task));
     }
 
-    /// The longest that a coordinator may be asked to think about an answer, so that one is not taken for
-    /// gone.
+    /// The longest that a coordinator may be asked to think about an answer, so that one is not
+    /// taken for gone.
     pub(crate) fn longest_wait(&self) -> Duration {
         LONGEST_WAIT.min(self.patience / 2)
     }

@@ -35,7 +35,8 @@ const TURNS_AT_HAND: usize = 1 + TURNS_AHEAD;
 /// that takes pixels slowly stops the threads.
 const MOST_TURNS_OF_PIXELS: usize = TURNS_AT_HAND + TURNS_AHEAD;
 
-/// The longest run that is asked for, for each thread: so many tiles, or so many turns of small ones.
+/// The longest run that is asked for, for each thread: so many tiles, or so many turns of small
+/// ones.
 const LONGEST_RUN_A_THREAD: usize = 32;
 const LONGEST_RUN_IN_TURNS: usize = 16;
 
@@ -458,8 +459,8 @@ impl Member {
         self.rendered.extend(tiles);
     }
 
-    /// The next tiles to be delivered, as many as a message may hold; none while enough are on their
-    /// way.
+    /// The next tiles to be delivered, as many as a message may hold; none while enough are on
+    /// their way.
     fn next_delivery(&mut self) -> Vec<Delivery> {
         let (mut tiles, mut bytes) = (Vec::<Delivery>::new(), 0);
         while self.delivering_count + tiles.len() < TURNS_AHEAD * self.turn * self.threads
@@ -544,8 +545,8 @@ impl Member {
         }
     }
 
-    /// Forgets scenes that no lease needs, those first that were asked for longest ago, until the others
-    /// and the one that is wanted have room; then has that one brought.
+    /// Forgets scenes that no lease needs, those first that were asked for longest ago, until the
+    /// others and the one that is wanted have room; then has that one brought.
     fn keep_scenes(&mut self, tasks: &mut Tasks) {
         let wanted = self.fetching.as_ref().map_or(0, |run| run.job.scene_byte_count);
         let mut bytes = self.scenes.iter().map(|(_, bytes)| bytes).sum::<u64>() + wanted;

@@ -109,8 +109,8 @@ impl Farm {
         self.last_job
     }
 
-    /// Event: a picture is ordered under a number from [`Farm::number_job`]. Some of its tiles may be
-    /// done already, the others are free.
+    /// Event: a picture is ordered under a number from [`Farm::number_job`]. Some of its tiles may
+    /// be done already, the others are free.
     pub(crate) fn on_order(
         &mut self,
         id: JobId,
@@ -144,8 +144,8 @@ impl Farm {
         actions
     }
 
-    /// Event: a job that has ended so, and as long ago, is there for its clients, as an earlier start
-    /// of the farm kept it.
+    /// Event: a job that has ended so, and as long ago, is there for its clients, as an earlier
+    /// start of the farm kept it.
     pub(crate) fn on_kept(
         &mut self,
         id: JobId,
@@ -161,7 +161,8 @@ impl Farm {
         actions
     }
 
-    /// What a job has got so far: how long it has been rendered, and how many workers brought tiles.
+    /// What a job has got so far: how long it has been rendered, and how many workers brought
+    /// tiles.
     pub(crate) fn so_far(&self, job: JobId, now: Instant) -> Option<(Duration, u32)> {
         self.jobs.get(&job).map(|job| (job.elapsed(now), job.progress.worker_count))
     }

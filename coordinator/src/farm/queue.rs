@@ -322,7 +322,8 @@ impl Farm {
         }
     }
 
-    /// Forgets jobs that ended long ago, and the oldest when there are too many or they are too large.
+    /// Forgets jobs that ended long ago, and the oldest when there are too many or they are too
+    /// large.
     pub(super) fn forget_old(&mut self, now: Instant, actions: &mut Vec<Action>) {
         let size = |id: JobId| self.jobs.get(&id).map_or(0, |job| job.terms.byte_count);
         let mut byte_count: u64 = self.ended.iter().map(|&(_, id)| size(id)).sum();

@@ -9,15 +9,16 @@ use crate::tiles::Tiles;
 /// Tiles that came into a picture.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub(crate) struct Arrived {
-    /// It is another number when tiles were taken out of the picture, or the job began again: then what
-    /// was known of it counts no more.
+    /// It is another number when tiles were taken out of the picture, or the job began again: then
+    /// what was known of it counts no more.
     pub(crate) generation: u32,
     /// Those that came after the ones asked for, and who brought them.
     pub(crate) tiles: Vec<(TileId, WorkerId)>,
 }
 
 impl Farm {
-    /// Which tiles came into a job's picture since this start of the farm, but for the first `seen`.
+    /// Which tiles came into a job's picture since this start of the farm, but for the first
+    /// `seen`.
     pub(crate) fn arrived(&self, job: JobId, seen: usize) -> Option<Arrived> {
         let job = self.jobs.get(&job)?;
         let came = job.brought.get(seen..).unwrap_or_default();
@@ -25,8 +26,8 @@ impl Farm {
         Some(Arrived { generation: job.progress.retry_count + job.progress.taken_back, tiles })
     }
 
-    /// Says of each tile of a job, by its number, whether it is in the picture. `None` where that is
-    /// not known, since an earlier start of the farm saw the job's end.
+    /// Says of each tile of a job, by its number, whether it is in the picture. `None` where that
+    /// is not known, since an earlier start of the farm saw the job's end.
     pub(crate) fn done(&self, job: JobId) -> Option<Vec<bool>> {
         let known = self.jobs.get(&job)?;
         let flags = |tiles: &Tiles| {
@@ -45,8 +46,8 @@ impl Farm {
         self.members.is_empty()
     }
 
-    /// The tiles of a job that workers have and have not brought, and whether they are known to have
-    /// begun them.
+    /// The tiles of a job that workers have and have not brought, and whether they are known to
+    /// have begun them.
     pub(crate) fn in_work(&self, job: JobId) -> Vec<(TileId, WorkerId, bool)> {
         self.leases.in_work(job).collect()
     }

@@ -309,8 +309,8 @@ impl JobsService {
     }
 }
 
-/// A job that no client knows of yet. It is cancelled when this is dropped, as it is with the answer
-/// that nobody waits for any more.
+/// A job that no client knows of yet. It is cancelled when this is dropped, as it is with the
+/// answer that nobody waits for any more.
 pub(super) struct Unclaimed {
     shell: Arc<Shell>,
     job: Option<JobId>,

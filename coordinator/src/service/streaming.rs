@@ -17,8 +17,9 @@ use crate::{accept::Peer, job::Job, shell::Shell};
 
 pub(super) type Chunks = Pin<Box<dyn Stream<Item = Result<wire::Chunk, Status>> + Send>>;
 
-/// Streams a file in pieces; `job` is kept until the last one has gone. A piece is read when the one
-/// before it is on the wire: a reader that takes none holds no thread, and in the end loses its connection.
+/// Streams a file in pieces; `job` is kept until the last one has gone. A piece is read when the
+/// one before it is on the wire: a reader that takes none holds no thread, and in the end loses its
+/// connection.
 pub(super) fn stream_file(
     file: std::fs::File,
     job: Arc<Job>,

@@ -148,8 +148,8 @@ impl farm_server::Farm for FarmService {
 /// The places in a message of tiles that were handed on, and what is decided about each of them.
 pub(super) type Taken = (Vec<usize>, oneshot::Receiver<Vec<Verdict>>);
 
-/// Reads tiles and hands on those that there are and whose pixels make sense. `None` when none does.
-/// This hashes and writes: never call it on the async runtime.
+/// Reads tiles and hands on those that there are and whose pixels make sense. `None` when none
+/// does. This hashes and writes: never call it on the async runtime.
 pub(super) fn take(
     shell: &Shell,
     worker: WorkerId,

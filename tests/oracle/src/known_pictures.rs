@@ -68,7 +68,8 @@ const BALL: &str = "lights ambient 0.5 endlights
         sphere coords -4.2 0.3 0.6 radius 1.5 material bright endsphere endgeometry";
 
 /// What is seen directly, `width` pixels wide and three quarters as high: outlines of spheres,
-/// outlines of polygons, a hard shadow, the light of a lamp, the light that a ball out of sight sends on.
+/// outlines of polygons, a hard shadow, the light of a lamp, the light that a ball out of sight
+/// sends on.
 pub fn known_pictures(width: u32) -> Vec<KnownPicture> {
     let size = known_size(width);
     vec![spheres(size), polygons(size), shadow(size), lamp(size), ball(size)]

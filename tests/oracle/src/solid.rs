@@ -54,8 +54,9 @@ impl SolidFaces {
 
     /// Where the ray's line enters and leaves the solid, in ascending order.
     ///
-    /// All leaves are bounded, so the line starts outside of all. Crossings at the same time count as one step: what is
-    /// left out or put in by single points or lines is not the solid's boundary.
+    /// All leaves are bounded, so the line starts outside of all. Crossings at the same time count
+    /// as one step: what is left out or put in by single points or lines is not the solid's
+    /// boundary.
     pub(crate) fn cross<'a>(
         &self,
         faces: &'a [Face],

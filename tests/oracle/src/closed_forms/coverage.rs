@@ -222,8 +222,9 @@ pub fn area(outline: &[DVec2]) -> f64 {
     rest.windows(2).map(|pair| (pair[0] - first).perp_dot(pair[1] - first)).sum::<f64>() / 2.0
 }
 
-/// The mean between two coordinates of a wave that is 1 from 0 to 1/2, -1 from there to 1, and so on, but
-/// for edges that slope over `slope` units, at most 1/2: what interpolation makes of a row of texels.
+/// The mean between two coordinates of a wave that is 1 from 0 to 1/2, -1 from there to 1, and so
+/// on, but for edges that slope over `slope` units, at most 1/2: what interpolation makes of a row
+/// of texels.
 pub fn wave_mean(from: f64, to: f64, slope: f64) -> f64 {
     let half = slope / 2.0;
     let up_to = |x: f64| {
