@@ -182,6 +182,22 @@ impl<'a> Sampler<'a> {
         }
         drop(pixels);
 
+        self.sample_open(area, wanted, most, search.as_ref(), open, &mut estimates)?;
+        ControlFlow::Continue(estimates)
+    }
+
+    /// Gives the pixels of `area` that are open after their first samples rounds of more, until each one is
+    /// what is wanted or has `most`.
+    fn sample_open(
+        &mut self,
+        area: Area,
+        wanted: &Wanted,
+        most: u32,
+        search: Option<&UnseenSearch<'a>>,
+        mut open: Vec<OpenPixel>,
+        estimates: &mut [Estimate],
+    ) -> ControlFlow<()> {
+        let seed = self.quality.seed;
         let mut count = 1;
         while !open.is_empty() && count < most {
             let next = most.min((2 * count).max(FEWEST_FOR_ERROR));
@@ -192,14 +208,14 @@ impl<'a> Sampler<'a> {
                 behind[place].pixel.add(color);
             })?;
             for open in behind {
-                open.note_samples(search.as_ref(), area, seed, count);
+                open.note_samples(search, area, seed, count);
                 estimates[open.index as usize] = open.pixel.estimate(wanted);
             }
             open.retain(|open| !open.pixel.is_done(wanted));
             count = next;
         }
         self.tally.capped += open.len() as u64;
-        ControlFlow::Continue(estimates)
+        ControlFlow::Continue(())
     }
 
     /// Finds the faces in the pixels of `area` that none of the first samples has met: for some
