@@ -4,9 +4,10 @@
 //!     cargo bench -p rtfarm-core --bench rays -- --check | --update
 //!
 //! The first prints millions of rays a second for each instruction set: medians of five runs on one
-//! thread; with corners in single precision, or of the scene in its compact form. `--check` counts instructions by callgrind with AVX2 and fails where a ray takes over 3 %
-//! more than `rays.tsv` says; `--update` writes that file anew. Both say so and do nothing else
-//! where valgrind or AVX2 is missing.
+//! thread; with corners in single precision, or of the scene in its compact form. `--check` counts
+//! instructions by callgrind with AVX2 and fails where a ray takes over 3 % more than `rays.tsv`
+//! says; `--update` writes that file anew. Both say so and do nothing else where valgrind or AVX2
+//! is missing.
 
 #![expect(clippy::print_stdout, reason = "a benchmark prints its figures")]
 #![expect(clippy::disallowed_methods, reason = "a benchmark reads the clock and makes a bottle")]

@@ -2,9 +2,9 @@
 //!
 //!     cargo bench -p rtfarm-core --bench solids [-- die | sponge SIDE]
 //!
-//! Prints nanoseconds a ray, medians of nine runs on one thread: through a die with 21 pips and four
-//! holes, 27 leaves, and through sponges, cubes less SIDE^3 balls that touch. `die` and `sponge` print
-//! the scene instead, for whole commands.
+//! Prints nanoseconds a ray, medians of nine runs on one thread: through a die with 21 pips and
+//! four holes, 27 leaves, and through sponges, cubes less SIDE^3 balls that touch. `die` and
+//! `sponge` print the scene instead, for whole commands.
 
 #![expect(clippy::print_stdout, reason = "a benchmark prints its figures")]
 #![expect(clippy::disallowed_methods, reason = "a benchmark reads the clock")]

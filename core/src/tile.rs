@@ -300,8 +300,8 @@ impl TileGrid {
             .expect("five sides were tried")
     }
 
-    /// The same window in tiles of twice the side, unless they are above 64 pixels or fewer than 150
-    /// then: where first samples are taken around a tile, too, larger ones need fewer of them.
+    /// The same window in tiles of twice the side, unless they are above 64 pixels or fewer than
+    /// 150 then: where first samples are taken around a tile, too, larger ones need fewer of them.
     #[must_use]
     pub fn with_less_rim(self) -> Self {
         let wider = Self { side: 2 * self.side, ..self };

@@ -40,8 +40,9 @@ pub(crate) fn above(value: f64) -> f32 {
     stepped(rounded, i32::from(f64::from(rounded) < value))
 }
 
-/// Goes up by a step between floating-point numbers, down by minus one or nowhere by none, without a
-/// branch, as nobody can guess how a number was rounded. A zero is left only to the side of its sign.
+/// Goes up by a step between floating-point numbers, down by minus one or nowhere by none, without
+/// a branch, as nobody can guess how a number was rounded. A zero is left only to the side of its
+/// sign.
 #[inline(always)]
 fn stepped(number: f32, step: i32) -> f32 {
     let bits = number.to_bits();

@@ -43,18 +43,18 @@ impl HashFunction {
     }
 }
 
-/// Finds the indices below `count` whose hashes are equal, on rayon's threads: `tell` is called with
-/// those of each hash that two or more have, or that one has which `may_be_alone`, in ascending order,
-/// and adds what follows from them to a list. The lists come in the order of the hashes. Leading bits
-/// have to be as good as random, and only 32 of them and a few more are compared: now and then indices
-/// come together whose hashes are nearly equal.
+/// Finds the indices below `count` whose hashes are equal, on rayon's threads: `tell` is called
+/// with those of each hash that two or more have, or that one has which `may_be_alone`, in
+/// ascending order, and adds what follows from them to a list. The lists come in the order of the
+/// hashes. Leading bits have to be as good as random, and only 32 of them and a few more are
+/// compared: now and then indices come together whose hashes are nearly equal.
 ///
-/// Most vertices, triangles and planes of large meshes have no equal; these are found by bits, one in 16
-/// or fewer of which are set, and are not sorted.
+/// Most vertices, triangles and planes of large meshes have no equal; these are found by bits, one
+/// in 16 or fewer of which are set, and are not sorted.
 ///
 /// Sources: Bloom, "Space/Time Trade-offs in Hash Coding with Allowable Errors" (1970), with one
-/// function of one hash; shared out into parts that fit the nearest cache as by Manegold, Boncz & Kersten,
-/// "Optimizing Main-Memory Join on Modern Hardware" (2002).
+/// function of one hash; shared out into parts that fit the nearest cache as by Manegold, Boncz &
+/// Kersten, "Optimizing Main-Memory Join on Modern Hardware" (2002).
 pub(crate) fn groups_of_equal<R: Send>(
     count: u32,
     hash: impl Fn(u32) -> Option<u64> + Sync,

@@ -44,8 +44,8 @@ impl PointTable {
         Self { firsts: HashTable::with_capacity(capacity), hasher }
     }
 
-    /// Finds the entry of a point's place: occupied by the index of the first point there, or vacant.
-    /// `point_at` gives the points whose indices the table holds.
+    /// Finds the entry of a point's place: occupied by the index of the first point there, or
+    /// vacant. `point_at` gives the points whose indices the table holds.
     #[inline(always)]
     pub(crate) fn entry(
         &mut self,
@@ -58,7 +58,8 @@ impl PointTable {
     }
 }
 
-/// For every point, the first point in the same place, on rayon's threads. There are fewer than 2^32.
+/// For every point, the first point in the same place, on rayon's threads. There are fewer than
+/// 2^32.
 pub(crate) fn find_firsts<P: Sync>(points: &[P], bits_of: fn(&P) -> PointBits) -> Vec<u32> {
     let hasher = PointHasher::new();
     find_firsts_by(points, bits_of, |point| hasher.hash(point))
@@ -84,7 +85,8 @@ fn find_firsts_by<P: Sync>(
         },
     );
     let mut firsts: Vec<u32> = firsts.into_iter().map(AtomicU32::into_inner).collect();
-    // Points are compared in their own order, in which equal ones are mostly near each other in memory.
+    // Points are compared in their own order, in which equal ones are mostly near each other in
+    // memory.
     let strangers: Vec<u32> = (firsts.par_iter().zip(0..count))
         .filter(|&(&first, point)| bits_at(first) != bits_at(point))
         .map(|(_, point)| point)

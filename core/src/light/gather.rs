@@ -1,6 +1,6 @@
-//! Points gather the light that other faces send on: each sends a ray, where little counts only
-//! now and then, among many such faces some, and where the ray meets such a face, that place is lit in its turn and gives what
-//! it can.
+//! Points gather the light that other faces send on: each sends a ray, where little counts only now
+//! and then, among many such faces some, and where the ray meets such a face, that place is lit in
+//! its turn and gives what it can.
 
 use std::ops::ControlFlow;
 

@@ -56,8 +56,9 @@ pub(super) struct LightPlan<'a> {
     hemisphere: f64,
 }
 
-/// How many rays a receiver sends whose hemisphere is full of emitters: aiming at them is no gain, and
-/// where light comes from everywhere its noise is most of a picture's. Measured on a bowl and a room.
+/// How many rays a receiver sends whose hemisphere is full of emitters: aiming at them is no gain,
+/// and where light comes from everywhere its noise is most of a picture's. Measured on a bowl and a
+/// room.
 const RAYS_AMONG_EMITTERS: u32 = 4;
 
 impl<'a> LightPlan<'a> {
@@ -79,8 +80,8 @@ impl<'a> LightPlan<'a> {
     /// emitters. It is `None` where the one chosen leads below the receiver's horizon.
     ///
     /// Source: Veach & Guibas, "Optimally Combining Sampling Techniques for Monte Carlo Rendering"
-    /// (1995): the balance heuristic, here for the light of each emitter on its own, so that only the
-    /// chosen one's density must be known.
+    /// (1995): the balance heuristic, here for the light of each emitter on its own, so that only
+    /// the chosen one's density must be known.
     #[inline]
     pub(super) fn sample(&self, numbers: &GatherNumbers) -> Option<LightSample> {
         let Self { view, receiver, hemisphere, .. } = *self;

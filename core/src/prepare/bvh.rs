@@ -24,8 +24,8 @@ const BINS: usize = 16;
 /// Ranges of up to this many items have half as many bins.
 const FEW: usize = 32;
 
-/// Two items are joined where the box around them has less than this part of what their own boxes have of
-/// surface: half of it where these are the same.
+/// Two items are joined where the box around them has less than this part of what their own boxes
+/// have of surface: half of it where these are the same.
 const JOINED: f32 = 0.75;
 
 /// Which ranges are leaves.
@@ -71,8 +71,8 @@ impl Bounds {
     }
 }
 
-/// What the hierarchy is built over: an item, or two that are joined. In the bits of the fourth numbers
-/// of its box are the number of the first one and how many they are.
+/// What the hierarchy is built over: an item, or two that are joined. In the bits of the fourth
+/// numbers of its box are the number of the first one and how many they are.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct BuildPrimitive(Bounds);
 
@@ -86,8 +86,8 @@ impl BuildPrimitive {
         Self(Bounds { min, max: Vec4::new(x, y, z, f32::from_bits(1)) })
     }
 
-    /// Joins an item and the next one, where the box around both is so small that no split between them
-    /// would be worth its while: so it is for the two halves of a quadrangle.
+    /// Joins an item and the next one, where the box around both is so small that no split between
+    /// them would be worth its while: so it is for the two halves of a quadrangle.
     pub(super) fn joined(&self, next: &Self) -> Option<Self> {
         let mut both = self.0.join(&next.0);
         both.min.w = self.0.min.w;
@@ -125,8 +125,8 @@ struct BuildRange<'a> {
     leaves: Leaves,
 }
 
-/// Builds the hierarchy over `primitives` and brings them into the order in which leaves name their items.
-/// The root is node 0; every other node stands after its parent.
+/// Builds the hierarchy over `primitives` and brings them into the order in which leaves name their
+/// items. The root is node 0; every other node stands after its parent.
 pub(super) fn build_bvh(primitives: &mut [BuildPrimitive], leaves: Leaves) -> Vec<Node> {
     if primitives.is_empty() {
         return vec![Node::EMPTY];
@@ -319,8 +319,8 @@ impl Binning {
 }
 
 impl Split {
-    /// Brings those left of the split to the front; returns how many they are, and the bounds of twice
-    /// the centres on each side.
+    /// Brings those left of the split to the front; returns how many they are, and the bounds of
+    /// twice the centres on each side.
     fn partition(&self, primitives: &mut [BuildPrimitive]) -> (usize, [Bounds; 2]) {
         let is_left =
             |primitive: &BuildPrimitive| self.binning.bins(&primitive.0)[self.axis] < self.bin;

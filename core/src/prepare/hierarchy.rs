@@ -13,8 +13,8 @@ use crate::{
     prepared::node::{Child, Frame, Node},
 };
 
-/// The most faces in a leaf of a scene that is not compact. Splitting them further makes a triangle mesh
-/// no faster to trace and takes half as many bytes again.
+/// The most faces in a leaf of a scene that is not compact. Splitting them further makes a triangle
+/// mesh no faster to trace and takes half as many bytes again.
 const FEW: usize = 4;
 
 /// The hierarchy over all items of a scene: flat faces, spheres and solids.
@@ -75,7 +75,8 @@ fn round_bounds(surfaces: &Surfaces) -> impl Iterator<Item = (DVec3, DVec3)> {
 /// A thread joins items among so many.
 const JOINED_AT_ONCE: usize = 1 << 12;
 
-/// What the hierarchy is built over: flat faces, two at a time where they are as good as one, and all else.
+/// What the hierarchy is built over: flat faces, two at a time where they are as good as one, and
+/// all else.
 fn build_primitives(surfaces: &Surfaces, frame: &Frame) -> Vec<BuildPrimitive> {
     let flat = &surfaces.flat;
     let origin = DVec3::from_array(frame.origin);

@@ -1,10 +1,10 @@
 //! A scene into the records of a prepared scene.
 //!
-//! Every step takes what the step before it made, so they cannot be called in another order:
-//! faces are collected, scaled and welded, share their surfaces, get their hierarchy and are sorted
-//! into records in its order. Then lights find the surfaces that they lie on, materials their
-//! images, and emitters the light that they send on; a compact scene gets the nodes and the vertices
-//! of its form, and all is assembled as one block.
+//! Every step takes what the step before it made, so they cannot be called in another order: faces
+//! are collected, scaled and welded, share their surfaces, get their hierarchy and are sorted into
+//! records in its order. Then lights find the surfaces that they lie on, materials their images,
+//! and emitters the light that they send on; a compact scene gets the nodes and the vertices of its
+//! form, and all is assembled as one block.
 
 mod bvh;
 mod collect;
@@ -135,8 +135,8 @@ pub fn prepare_with(
     Ok(assemble(camera(&viewport, scale), lighting, frame, scale, features, &sections))
 }
 
-/// What builds the hierarchy of a scene, and that alone, for benchmarks; it tells how many nodes there
-/// are.
+/// What builds the hierarchy of a scene, and that alone, for benchmarks; it tells how many nodes
+/// there are.
 #[doc(hidden)]
 pub fn hierarchy_of(scene: &Scene) -> Result<impl Fn() -> usize, PrepareError> {
     let viewport = scene.viewport.ok_or(PrepareError::NoViewport)?;

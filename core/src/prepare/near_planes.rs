@@ -2,9 +2,9 @@
 //!
 //! A label on a tilted wall is given in decimals, as the wall is. Read as binary numbers, their
 //! planes are some roundings apart, and which of them a ray met first would be chance. So two faces
-//! of different primitives that overlap, and are nowhere there farther apart than [`ROUNDINGS`], lie
-//! in one plane, and so do all faces that such pairs join, if they are as near to the largest of
-//! them. The order of the faces has no part in it.
+//! of different primitives that overlap, and are nowhere there farther apart than [`ROUNDINGS`],
+//! lie in one plane, and so do all faces that such pairs join, if they are as near to the largest
+//! of them. The order of the faces has no part in it.
 
 use std::{collections::HashMap, ops::Range};
 
@@ -24,8 +24,8 @@ const ROUNDINGS: f64 = 8.0;
 /// The rounding of a number, over the number.
 const ROUNDING: f64 = f64::EPSILON / 2.0;
 
-/// At most so many pairs are looked at. Where thousands of faces cross each other in planes that are
-/// nearly one there are more; then some that are not exactly one stay apart.
+/// At most so many pairs are looked at. Where thousands of faces cross each other in planes that
+/// are nearly one there are more; then some that are not exactly one stay apart.
 const MOST_PAIRS: u64 = 1 << 26;
 
 /// Sets of faces that lie in one plane within rounding, the largest face of each set first. Faces
@@ -119,7 +119,8 @@ struct Key {
     bounds: Bounds,
 }
 
-/// The keys of some faces, by their least numbers, but for faces so thin that any plane could be theirs.
+/// The keys of some faces, by their least numbers, but for faces so thin that any plane could be
+/// theirs.
 fn keys(flat: &FlatFaces, faces: &[u32]) -> Vec<Key> {
     // A direction that no modeller prefers.
     const DIRECTION: DVec3 = DVec3::new(0.483, 0.836, 0.259);
@@ -376,7 +377,8 @@ mod tests {
     use super::*;
     use crate::prepare::flat::FaceAttributes;
 
-    /// Squares, some of them roundings before the plane x + 2y + 3z = 0, at a multiple of their side.
+    /// Squares, some of them roundings before the plane x + 2y + 3z = 0, at a multiple of their
+    /// side.
     fn squares(places: &[(f64, f64)]) -> FlatFaces {
         let (u, v) = (DVec3::new(0.2, -0.1, 0.0), DVec3::new(0.3, 0.0, -0.1));
         let normal = u.cross(v).normalize();

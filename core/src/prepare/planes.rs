@@ -1,8 +1,8 @@
 //! Which flat faces lie in one plane.
 //!
-//! Coincident faces must be met at one distance, and a ray that leaves a face must not meet
-//! another that lies on it. So faces in the same plane, exactly or as far as rounding can tell, share
-//! one plane record. Real scenes hold thousands of copies of one triangle, and labels that lie in a
+//! Coincident faces must be met at one distance, and a ray that leaves a face must not meet another
+//! that lies on it. So faces in the same plane, exactly or as far as rounding can tell, share one
+//! plane record. Real scenes hold thousands of copies of one triangle, and labels that lie in a
 //! wall.
 
 use glam::DVec3;

@@ -3,7 +3,8 @@
 use super::sort::Sorted;
 use crate::prepared::record::{EmitterRecord, FaceRecord};
 
-/// Takes out the vertices that single precision holds exactly. All get new numbers, the others first.
+/// Takes out the vertices that single precision holds exactly. All get new numbers, the others
+/// first.
 pub(super) fn split_vertices(faces: &mut Sorted, emitters: &mut [EmitterRecord]) -> Vec<[f32; 3]> {
     let is_single = |vertex: &[f64; 3]| vertex.iter().all(|&x| f64::from(x as f32) == x);
     let (mut singles, mut doubles) = (Vec::new(), Vec::new());

@@ -17,8 +17,8 @@ use crate::{
 /// How many ulp of its coordinates the boxes of a solid are larger on every side.
 const MARGIN: f64 = 10.0 * f64::EPSILON * (1_u64 << 30) as f64;
 
-/// The largest doubt of a crossing is this part of the solid's size, and besides as large as that of a
-/// face that is met at a cosine of 1/64: this part of the margin.
+/// The largest doubt of a crossing is this part of the solid's size, and besides as large as that
+/// of a face that is met at a cosine of 1/64: this part of the margin.
 const GRAZED: f64 = 1.0 / (1 << 17) as f64;
 const STEEP: f64 = 1.0 / (1 << 24) as f64;
 
@@ -41,8 +41,8 @@ pub(super) fn enclose_leaves(
     let extent = leaves.iter().map(|leaf| leaf.extent).fold(0.0, f64::max);
     // A ray is brought to within 8 / `scale` of the middle before it meets the solid.
     solid.margin = MARGIN * (extent + middle.length() + 32.0 * size);
-    // Where a ray grazes a face, how far it goes within rounding of it says little of the faces that
-    // it meets on its way: they must not vanish in that doubt.
+    // Where a ray grazes a face, how far it goes within rounding of it says little of the faces
+    // that it meets on its way: they must not vanish in that doubt.
     solid.most_doubt = (size * GRAZED + solid.margin * STEEP).min(solid.margin / 8.0);
     let scale = power_of_two_below_inverse(size + 2.0 * solid.margin);
     solid.frame = Frame { origin: middle.to_array(), scale };

@@ -44,8 +44,8 @@ pub(super) struct Sorted {
 }
 
 impl Sorted {
-    /// The plane that a triangle shares with other faces, if it does, and its material; `None` for an
-    /// item of another kind.
+    /// The plane that a triangle shares with other faces, if it does, and its material; `None` for
+    /// an item of another kind.
     pub(super) fn plane_and_material(
         &self,
         face: &FaceRecord,
@@ -62,13 +62,14 @@ impl Sorted {
 }
 
 impl FlatFaces {
-    /// The points of the corners of an item, of three or four, which are none for one that is not flat.
+    /// The points of the corners of an item, of three or four, which are none for one that is not
+    /// flat.
     fn gather(&self, item: usize) -> &[u32] {
         if item < self.item_count() { &self.corners[self.corner_range(item)] } else { &[] }
     }
 
-    /// Numbers points in the order in which items come to them: the points in that order, and the number
-    /// of each.
+    /// Numbers points in the order in which items come to them: the points in that order, and the
+    /// number of each.
     fn number_points(&self, order: &[u32]) -> (Vec<u32>, Vec<AtomicU32>) {
         // The place of the corner that comes to each point first, then its number.
         let none = || AtomicU32::new(u32::MAX);

@@ -38,8 +38,8 @@ impl PreparedBytes {
         Self { lines, length: bytes.len() }
     }
 
-    /// Bytes that `read` puts into places, of which it is told where among all `length` they begin; it is
-    /// called on rayon's threads.
+    /// Bytes that `read` puts into places, of which it is told where among all `length` they begin;
+    /// it is called on rayon's threads.
     pub fn read<E: Send>(
         length: usize,
         read: impl Fn(&mut [u8], usize) -> Result<(), E> + Sync,
@@ -72,7 +72,8 @@ impl AsRef<[u8]> for PreparedBytes {
 /// A thread copies at least so many lines in one go.
 const COPIED_AT_ONCE: usize = 1 << 13;
 
-/// Adds bytes, and zeros to the end of a line, on rayon's threads: each clears and fills pages of its own.
+/// Adds bytes, and zeros to the end of a line, on rayon's threads: each clears and fills pages of
+/// its own.
 fn push_bytes(lines: &mut Vec<Line>, bytes: &[u8]) {
     let (whole, rest) = bytes.as_chunks();
     lines.par_extend(whole.par_iter().with_min_len(COPIED_AT_ONCE).map(|&line| Line(line)));

@@ -49,8 +49,8 @@ impl<B: AsRef<[u8]>> PreparedScene<B> {
         Self::open_by(bytes, content_hash)
     }
 
-    /// [`PreparedScene::open`] on this thread alone, calling `on_step` after every 16 MiB, some 10 ms of
-    /// work.
+    /// [`PreparedScene::open`] on this thread alone, calling `on_step` after every 16 MiB, some 10
+    /// ms of work.
     pub fn open_in_steps(bytes: B, on_step: &mut dyn FnMut()) -> Result<Self, PreparedError> {
         Self::open_by(bytes, |data| {
             let mut hasher = blake3::Hasher::new();

@@ -1,7 +1,7 @@
 //! A node of the 8-wide hierarchy, and the frame of its boxes.
 //!
-//! Boxes are f32, relative to the scene's f64 frame and rounded outward; in a compact scene they are
-//! steps of 8 bits within their node.
+//! Boxes are f32, relative to the scene's f64 frame and rounded outward; in a compact scene they
+//! are steps of 8 bits within their node.
 
 /// Levels that a hierarchy may have: a path from the root visits at most this many nodes.
 pub(crate) const MOST_LEVELS: usize = 64;
@@ -84,17 +84,18 @@ impl Node {
     };
 }
 
-/// A [`Node`] in fewer bytes. Its boxes are rounded outward to steps, 255 at most, from the least corner
-/// of all of them.
+/// A [`Node`] in fewer bytes. Its boxes are rounded outward to steps, 255 at most, from the least
+/// corner of all of them.
 ///
-/// Source: Ylitie, Karras & Laine, "Efficient Incoherent Ray Traversal on GPUs Through Compressed Wide
-/// BVHs" (2017).
+/// Source: Ylitie, Karras & Laine, "Efficient Incoherent Ray Traversal on GPUs Through Compressed
+/// Wide BVHs" (2017).
 #[derive(Debug, Clone, Copy, PartialEq, bytemuck::Pod, bytemuck::Zeroable)]
 #[repr(C, align(32))]
 pub(crate) struct CompactNode {
     /// The least corner.
     origin: [f32; 3],
-    /// A step on each axis: the exponent of a power of two as an f32 has it in its bits, 0 for no step.
+    /// A step on each axis: the exponent of a power of two as an f32 has it in its bits, 0 for no
+    /// step.
     exponents: [u8; 3],
     padding: u8,
     /// As [`Node::planes`]. Those of an unused child mean nothing.
@@ -162,8 +163,8 @@ impl CompactNode {
     }
 }
 
-/// The place of a plane: so many steps from the origin, rounded once, so that it keeps the order of the
-/// steps.
+/// The place of a plane: so many steps from the origin, rounded once, so that it keeps the order of
+/// the steps.
 #[inline(always)]
 fn plane_at(origin: f32, exponent: u8, steps: u8) -> f32 {
     origin + f32::from_bits(u32::from(exponent) << 23) * f32::from(steps)

@@ -102,8 +102,8 @@ impl Surface {
     pub(crate) const NONE: Self = Self(u32::MAX);
 }
 
-/// A face in the prepared scene: its kind in the upper 3 bits, its index below: that of a triangle in
-/// the section `faces`, that of all others among their kind.
+/// A face in the prepared scene: its kind in the upper 3 bits, its index below: that of a triangle
+/// in the section `faces`, that of all others among their kind.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, bytemuck::Pod, bytemuck::Zeroable)]
 #[repr(transparent)]
 pub(crate) struct Item(u32);
@@ -279,7 +279,8 @@ pub(crate) struct SolidRecord {
     /// The boxes of the leaves are larger by this on every side: what a ray passes by farther off
     /// changes nothing.
     pub(crate) margin: f64,
-    /// No crossing of a leaf is in doubt by more than this, which is an eighth of the margin at most.
+    /// No crossing of a leaf is in doubt by more than this, which is an eighth of the margin at
+    /// most.
     pub(crate) most_doubt: f64,
     first_node: u32,
     node_count: u32,
@@ -390,8 +391,8 @@ pub(crate) struct LeafRecord {
     pub(crate) node: u32,
     /// 1 where an odd number of differences takes it away, so that its faces look inward.
     pub(crate) is_reversed: u32,
-    /// Equal spheres have one surface, within solids or without. Of a parallelepiped it is the place
-    /// in the section `box_planes`: its faces have the surfaces of their planes.
+    /// Equal spheres have one surface, within solids or without. Of a parallelepiped it is the
+    /// place in the section `box_planes`: its faces have the surfaces of their planes.
     pub(crate) surface: u32,
     /// Twice the distance of its farthest point from the origin, or a little more: the size of the
     /// numbers that rounding counts by.

@@ -24,7 +24,8 @@ pub(super) struct FirstRound {
     pub(super) verdicts: Vec<Verdict>,
 }
 
-/// What follows for a pixel, as [`Pixel::is_done`], [`Pixel::is_suspect`] and [`Pixel::estimate`] say.
+/// What follows for a pixel, as [`Pixel::is_done`], [`Pixel::is_suspect`] and [`Pixel::estimate`]
+/// say.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Verdict {
     pub(super) is_done: bool,
@@ -167,8 +168,8 @@ impl InLanes<'_> {
     }
 }
 
-/// How far nine samples, row by row, lie from the plane that fits them best, as [`Neighbourhood`] tells
-/// it channel by channel.
+/// How far nine samples, row by row, lie from the plane that fits them best, as [`Neighbourhood`]
+/// tells it channel by channel.
 #[inline(always)]
 fn variance_about_plane(colors: &[f64; NINE]) -> f64 {
     let (mut sum, mut across_slope, mut down_slope) = (0.0, 0.0, 0.0);

@@ -1,9 +1,9 @@
 //! A tile of a prepared scene into pixels.
 //!
-//! A pixel's samples are added in their own order, and each is a pure function of (scene,
-//! quality, pixel, sample); how many there are hangs on the first samples of the pixels at most three
-//! away and the first eight of those beside it, on the faces in its beam, and on its own later
-//! samples. So a pixel is the same to the bit whatever the tile, the batch, the thread or the CPU.
+//! A pixel's samples are added in their own order, and each is a pure function of (scene, quality,
+//! pixel, sample); how many there are hangs on the first samples of the pixels at most three away
+//! and the first eight of those beside it, on the faces in its beam, and on its own later samples.
+//! So a pixel is the same to the bit whatever the tile, the batch, the thread or the CPU.
 
 mod camera_rays;
 mod first_round;

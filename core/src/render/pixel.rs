@@ -76,7 +76,8 @@ pub(super) struct Neighbourhood {
 }
 
 impl Neighbourhood {
-    /// That of the pixel (x, y) of the frame; `colors` are those of `area`, which has all neighbours.
+    /// That of the pixel (x, y) of the frame; `colors` are those of `area`, which has all
+    /// neighbours.
     pub(super) fn new(area: Area, x: u32, y: u32, colors: &[DVec3]) -> Self {
         let [columns, rows] = [(x, area.columns()), (y, area.rows())]
             .map(|(middle, all)| all.start.max(middle.saturating_sub(1))..all.end.min(middle + 2));
@@ -106,7 +107,8 @@ impl Neighbourhood {
         colors.fold(DVec3::NEG_INFINITY, DVec3::max) - low
     }
 
-    /// In which channels the samples tell an edge between two shades: all lie at either end of them.
+    /// In which channels the samples tell an edge between two shades: all lie at either end of
+    /// them.
     fn is_edge(&self) -> BVec3 {
         let colors = self.colors().iter().copied();
         let low = colors.clone().fold(DVec3::INFINITY, DVec3::min);
@@ -198,25 +200,25 @@ const EDGE: f64 = 0.65;
 /// have none.
 pub(super) const UNSEEN: f64 = 1.5;
 
-/// How much the runs' variance counts in the decision to stop. The more it does the more pixels stop
-/// where runs agree by chance; without it thin wires do while too few samples have met them.
+/// How much the runs' variance counts in the decision to stop. The more it does the more pixels
+/// stop where runs agree by chance; without it thin wires do while too few samples have met them.
 const DECISION_OF_RUNS: f64 = 1.0 / 4.0;
 
 /// The share of the variance of a neighbourhood's first samples that their neighbours may hide: an
 /// edge that crosses a corner of a pixel, met by no first sample around.
 pub(super) const HIDDEN: f64 = 1.0 / 128.0;
 
-/// What counts of a missed contrast in the error that is told, while decisions fear all of it: of the
-/// pixels that stay beside an edge it crosses some only. Later it also stands for what pixels hide that
-/// stopped where samples agree by chance; in the first round few do.
+/// What counts of a missed contrast in the error that is told, while decisions fear all of it: of
+/// the pixels that stay beside an edge it crosses some only. Later it also stands for what pixels
+/// hide that stopped where samples agree by chance; in the first round few do.
 const CROSSED: f64 = 0.75;
 const CROSSED_AT_FIRST: f64 = 0.3;
 
-/// What counts of the variance that a neighbourhood tells which an edge between two shades crosses, in
-/// the error that is told of one sample. A straight edge with the contrast c crosses one pixel in each row,
-/// whose sample's variance is c²/6 on average. The plane through samples around it takes it for
-/// noise of all three pixels beside it, which adds up to 1.67 times as much: measured on spheres and
-/// polygons.
+/// What counts of the variance that a neighbourhood tells which an edge between two shades crosses,
+/// in the error that is told of one sample. A straight edge with the contrast c crosses one pixel
+/// in each row, whose sample's variance is c²/6 on average. The plane through samples around it
+/// takes it for noise of all three pixels beside it, which adds up to 1.67 times as much: measured
+/// on spheres and polygons.
 pub(super) const CROSSED_BY_EDGE: f64 = 0.6;
 
 /// Two shades lie this many times as far apart as what they differ in themselves, or more.
@@ -237,12 +239,12 @@ pub(super) struct Wanted {
 /// What covers less of a pixel is thin: few samples meet it, by chance more or less.
 const THIN_SHARE: f64 = 1.0 / 4.0;
 
-/// A thing that covers a small share of a pixel may have so many times the variance of one sample that
-/// is expected of it, where samples happened to meet it too often.
+/// A thing that covers a small share of a pixel may have so many times the variance of one sample
+/// that is expected of it, where samples happened to meet it too often.
 const THIN: f64 = 3.0;
 
-/// As long as it is more probable than this that all samples miss a thing, what the mean lacks without it
-/// counts [`FEAR`] times.
+/// As long as it is more probable than this that all samples miss a thing, what the mean lacks
+/// without it counts [`FEAR`] times.
 const MOST_MISSED: f64 = 1.0 / 7.0;
 const FEAR: f64 = 4.0;
 
@@ -264,9 +266,9 @@ fn power(base: f64, exponent: u32) -> f64 {
     product
 }
 
-/// The variance that something adds in the decision to stop, whether samples met it or not: where pixels
-/// in which they did go on and others stop, light is lacking. It covers this share of the pixel, and the
-/// mean lacks so much if no sample meets it.
+/// The variance that something adds in the decision to stop, whether samples met it or not: where
+/// pixels in which they did go on and others stop, light is lacking. It covers this share of the
+/// pixel, and the mean lacks so much if no sample meets it.
 pub(super) fn feared(share: f64, lack: DVec3, count: u32) -> DVec3 {
     let (n, missed) = (f64::from(count), missed(share, count));
     let expected = (EDGE / (n * n.sqrt())).lerp(1.0 / n, DECISION_OF_RUNS) * (1.0 - share) / share;
@@ -300,10 +302,10 @@ impl Pixel {
         }
     }
 
-    /// Notes the noise of a neighbourhood, which has this pixel too, if it is alike and all have had
-    /// the first round. The own samples are left out: where they decide when to stop, those whose
-    /// samples agree by chance stop, and that is a bias of their mean, as it hangs together with
-    /// their variance, and of the error they tell.
+    /// Notes the noise of a neighbourhood, which has this pixel too, if it is alike and all have
+    /// had the first round. The own samples are left out: where they decide when to stop, those
+    /// whose samples agree by chance stop, and that is a bias of their mean, as it hangs together
+    /// with their variance, and of the error they tell.
     pub(super) fn set_noise<'a>(&mut self, around: &(impl Iterator<Item = &'a Self> + Clone)) {
         let count = around.clone().count();
         if count < 2 || around.clone().any(|pixel| pixel.count() < FEWEST_FOR_ERROR) {
@@ -345,8 +347,8 @@ impl Pixel {
         self.contrast = high - low;
     }
 
-    /// Notes what faces that the first sample missed add to the variance of the mean, and in the decision
-    /// to stop, and the share of the pixel, 0..=1, of those that later samples met.
+    /// Notes what faces that the first sample missed add to the variance of the mean, and in the
+    /// decision to stop, and the share of the pixel, 0..=1, of those that later samples met.
     pub(super) fn set_unseen(&mut self, variance: DVec3, feared: DVec3, passed_share: f64) {
         (self.unseen, self.feared, self.passed_share) = (variance, feared, passed_share);
     }
@@ -415,9 +417,9 @@ impl Pixel {
         (self.squares / n - mean * mean).max(DVec3::ZERO) * (n / (n - 1.0))
     }
 
-    /// `variance` of what is left of a pixel that is clipped at full light: 0 in the channels that are
-    /// certainly above it, and nowhere more than the square of full light. Samples count as if they lay
-    /// by chance, for nobody knows what follows.
+    /// `variance` of what is left of a pixel that is clipped at full light: 0 in the channels that
+    /// are certainly above it, and nowhere more than the square of full light. Samples count as if
+    /// they lay by chance, for nobody knows what follows.
     fn unclipped(&self, variance: DVec3, wanted: &Wanted) -> DVec3 {
         if wanted.full_light == f64::INFINITY {
             return variance;

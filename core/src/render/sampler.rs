@@ -24,10 +24,10 @@ use crate::{
 /// Camera rays in a batch: enough to fill the queues, few enough to stay in the cache.
 const BATCH: usize = 512;
 
-/// The side of what an adaptive sample sees of a texture, as a share of the square that it stands for.
-/// What a filter takes from beyond the square is in all samples and no difference of theirs tells it,
-/// so adaptive pixels would stop at that. With half the side this error is a fourth, and some more noise
-/// is told.
+/// The side of what an adaptive sample sees of a texture, as a share of the square that it stands
+/// for. What a filter takes from beyond the square is in all samples and no difference of theirs
+/// tells it, so adaptive pixels would stop at that. With half the side this error is a fourth, and
+/// some more noise is told.
 const SHARPENED: f64 = 0.5;
 
 /// Gives pixels their samples, a batch at a time.
@@ -79,7 +79,8 @@ impl<'a> Sampler<'a> {
         ControlFlow::Continue(pixels.iter().map(Runs::estimate).collect())
     }
 
-    /// The pixels of `area` with samples until each one is what is wanted: one each at first, more where the neighbourhood's samples or the faces in the beam ask for them.
+    /// The pixels of `area` with samples until each one is what is wanted: one each at first, more
+    /// where the neighbourhood's samples or the faces in the beam ask for them.
     fn sample_as_needed(
         &mut self,
         area: Area,
@@ -117,8 +118,8 @@ impl<'a> Sampler<'a> {
             None => Vec::new(),
         };
 
-        // Where the first samples lie apart the pixels around get more, and what these see opens the
-        // pixels beside them: an edge may cross a corner that no first sample met.
+        // Where the first samples lie apart the pixels around get more, and what these see opens
+        // the pixels beside them: an edge may cross a corner that no first sample met.
         let round = FirstRound::new(far, wide, &colors, wanted, self.isa);
         let mut is_near_suspect = vec![false; far.pixel_count()];
         for ((x, y), _) in far.pixels().zip(&round.verdicts).filter(|(_, told)| told.is_suspect) {
@@ -186,8 +187,8 @@ impl<'a> Sampler<'a> {
         ControlFlow::Continue(estimates)
     }
 
-    /// Gives the pixels of `area` that are open after their first samples rounds of more, until each one is
-    /// what is wanted or has `most`.
+    /// Gives the pixels of `area` that are open after their first samples rounds of more, until
+    /// each one is what is wanted or has `most`.
     fn sample_open(
         &mut self,
         area: Area,

@@ -27,8 +27,8 @@ pub struct Quality {
     pub flat: bool,
     /// Surfaces that mirror light others.
     pub secondary: bool,
-    /// More than full light is worth no more: who keeps the picture clips it. Adaptive pixels that are
-    /// certainly above it get no more samples, and have no error there.
+    /// More than full light is worth no more: who keeps the picture clips it. Adaptive pixels that
+    /// are certainly above it get no more samples, and have no error there.
     pub clips: bool,
 }
 

@@ -35,8 +35,8 @@ use crate::{
 /// The depth of the last rays that are traced; camera rays have depth 0.
 pub const DEEPEST: u32 = 64;
 
-/// A branch of at least this weight in its sample is always followed. Lighter ones are by chance, and
-/// then weigh as much. The noise that this adds to a sample is about half of it.
+/// A branch of at least this weight in its sample is always followed. Lighter ones are by chance,
+/// and then weigh as much. The noise that this adds to a sample is about half of it.
 const FULL_WEIGHT: f64 = 1.0 / 256.0;
 
 /// A queue of more rays than this is worked through in parts, as long as it has several samples.
@@ -68,7 +68,8 @@ pub(super) struct Wavefront {
     first_hits: Vec<Hit>,
     /// What each sample sees.
     colors: Vec<DVec3>,
-    /// Branches below this weight count as background; `None`: roulette decides about the light ones.
+    /// Branches below this weight count as background; `None`: roulette decides about the light
+    /// ones.
     cutoff: Option<f64>,
     roulette: Roulette,
     /// For each sample, the weight of its branches that were not traced but count as background.
@@ -119,14 +120,14 @@ impl Branch {
 /// Russian roulette among a sample's branches of one depth that are lighter than [`FULL_WEIGHT`]:
 /// in a row, each as long as its weight, they are combed with a tooth every [`FULL_WEIGHT`] from a
 /// random start on, and those that a tooth meets survive. So each survives with the probability
-/// weight / `FULL_WEIGHT`, and all together keep their weight within one tooth. They stand in the order of
-/// their [`Way`], so that those of the same way do so too.
+/// weight / `FULL_WEIGHT`, and all together keep their weight within one tooth. They stand in the
+/// order of their [`Way`], so that those of the same way do so too.
 ///
 /// Sources: a range of weights that paths are brought into by roulette, Vorba & Křivánek,
 /// "Adjoint-driven Russian roulette and splitting in light transport simulation" (2016); the comb,
 /// Booth, "A Weight (Charge) Conserving Importance-Weighted Comb for Monte Carlo" (1996); paths
-/// sorted by where they are, L'Ecuyer, Lécot & Tuffin, "A Randomized Quasi-Monte Carlo Simulation Method for
-/// Markov Chains" (2008).
+/// sorted by where they are, L'Ecuyer, Lécot & Tuffin, "A Randomized Quasi-Monte Carlo Simulation
+/// Method for Markov Chains" (2008).
 #[derive(Debug, Default)]
 struct Roulette {
     /// The light branches of one sample at one depth.
@@ -169,10 +170,10 @@ impl Roulette {
     }
 }
 
-/// How a branch leaves a face, in its high bits; the low ones are for a place in a row. Branches that
-/// leave the same face in the same way see much the same, and those of neighbours in this order similar
-/// things: first come those that leave backs, from the last face of the file to the first, then those that
-/// leave fronts, from the first to the last.
+/// How a branch leaves a face, in its high bits; the low ones are for a place in a row. Branches
+/// that leave the same face in the same way see much the same, and those of neighbours in this
+/// order similar things: first come those that leave backs, from the last face of the file to the
+/// first, then those that leave fronts, from the first to the last.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 struct Way(u64);
 
@@ -454,8 +455,8 @@ impl Wavefront {
         }
     }
 
-    /// Queues a ray, or has roulette decide about it where its branch counts little, unless that lies
-    /// too deep.
+    /// Queues a ray, or has roulette decide about it where its branch counts little, unless that
+    /// lies too deep.
     #[inline(always)]
     fn follow(
         &mut self,

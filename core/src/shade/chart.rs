@@ -8,8 +8,8 @@ use crate::{
     prepared::record::Texcoords,
 };
 
-/// A face as the image of the unit square: corner + s · along + t · up + s · t · twist. A triangle is
-/// the half below s + t = 1 of a parallelogram.
+/// A face as the image of the unit square: corner + s · along + t · up + s · t · twist. A triangle
+/// is the half below s + t = 1 of a parallelogram.
 ///
 /// The face is seen along the axis that its normal is closest to, from the side that sees its
 /// corners counter-clockwise, in units near its own size.
@@ -75,8 +75,8 @@ impl Chart {
         DVec2::new(s, if t > 0.0 { t.min(most) } else { 0.0 })
     }
 
-    /// Tells how a step along the face, in the block's units, moves the place. It is not finite where
-    /// the map folds.
+    /// Tells how a step along the face, in the block's units, moves the place. It is not finite
+    /// where the map folds.
     pub(super) fn step(&self, place: DVec2, step: DVec3) -> DVec2 {
         let step = self.project(step);
         let along = self.along + place.y * self.twist;

@@ -47,7 +47,8 @@ impl<'a> Interaction<'a> {
         Self::with_last(view, ray, hit, &mut None)
     }
 
-    /// The same. Rays that follow each other often meet one face: `last`, the last flat one, is known.
+    /// The same. Rays that follow each other often meet one face: `last`, the last flat one, is
+    /// known.
     #[inline(always)]
     pub(crate) fn with_last(
         view: &View<'a>,
@@ -81,8 +82,8 @@ impl<'a> Interaction<'a> {
         }
     }
 
-    /// The face's colour, its texture included, of which the sample sees `footprint`. There is none in
-    /// a scene without textures.
+    /// The face's colour, its texture included, of which the sample sees `footprint`. There is none
+    /// in a scene without textures.
     #[inline(always)]
     pub(crate) fn color(&self, view: &View<'_>, footprint: Option<SurfaceFootprint>) -> DVec3 {
         let color = DVec3::from_array(self.material.color);

@@ -67,8 +67,8 @@ impl RayDifferential {
         self.turn(direction, normal, curvature, [1.0, 2.0 * cosine, 2.0])
     }
 
-    /// Refracts it by n1/n2 = `ratio`, above 0; see [`RayDifferential::mirror`]. It is not finite at
-    /// the critical angle.
+    /// Refracts it by n1/n2 = `ratio`, above 0; see [`RayDifferential::mirror`]. It is not finite
+    /// at the critical angle.
     pub(crate) fn refract(
         &self,
         direction: DVec3,

@@ -77,8 +77,8 @@ impl<'a> TextureView<'a> {
     }
 
     /// Estimates the mean over a footprint, in linear RGB, by probes along its longer axis, each as
-    /// wide as its shorter one is there. A footprint within a texel gives the image itself, bilinear
-    /// between the middles of texels.
+    /// wide as its shorter one is there. A footprint within a texel gives the image itself,
+    /// bilinear between the middles of texels.
     pub(super) fn mean(&self, footprint: &TextureFootprint) -> DVec3 {
         // Source: McCormack, Perry, Farkas & Jouppi, "Feline: Fast Elliptical Lines for Anisotropic
         // Texture Mapping" (1999), but with the axes of the footprint's own ellipse, equal weights,

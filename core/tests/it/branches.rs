@@ -1,5 +1,5 @@
-//! Branches that are followed by chance: right on average, cheap, and bounded in memory and in the work
-//! between two reports of progress.
+//! Branches that are followed by chance: right on average, cheap, and bounded in memory and in the
+//! work between two reports of progress.
 
 use std::{env, fmt::Write, fs, ops::ControlFlow, process::Command};
 
@@ -50,7 +50,8 @@ fn render(scene: &PreparedScene<PreparedBytes>, quality: &Quality, area: Area) -
     render_tile(scene, quality, area, Isa::fastest(), go_on).expect("nobody stops it")
 }
 
-/// Numbers that estimate one: their mean, its standard error, and their root mean square about `truth`.
+/// Numbers that estimate one: their mean, its standard error, and their root mean square about
+/// `truth`.
 fn statistics(numbers: &[f64], truth: f64) -> (f64, f64, f64) {
     let count = numbers.len() as f64;
     let mean = numbers.iter().sum::<f64>() / count;
@@ -130,8 +131,8 @@ fn light_between_panes_adds_up_its_series() {
     }
 }
 
-/// What comes through panes of a transfer (transmitted, mirrored) by rays of at most this depth, and what is
-/// on its way then.
+/// What comes through panes of a transfer (transmitted, mirrored) by rays of at most this depth,
+/// and what is on its way then.
 fn through_panes(count: usize, (t, r): (f64, f64), deepest: u32) -> (f64, f64) {
     // The light between the panes, downwards and upwards; the first is before all of them.
     let (mut down, mut up) = (vec![0.0; count + 1], vec![0.0; count + 1]);

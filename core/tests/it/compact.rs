@@ -31,8 +31,8 @@ fn bytes(scene: &Scene, form: Form) -> PreparedBytes {
     prepare_as(scene, form).expect("a plain scene")
 }
 
-/// Hills of `2 * side * side` triangles, under a lamp, on a floor that shares its plane; corners are
-/// exact in single precision, or not one is.
+/// Hills of `2 * side * side` triangles, under a lamp, on a floor that shares its plane; corners
+/// are exact in single precision, or not one is.
 fn hills(side: u32, is_single: bool) -> Scene {
     let mut scene = read(
         "viewport origin 0.5 -1.2 0.9 topleft -0.1 0 0.6 bottomleft -0.1 0 0 topright 1.1 0 0.6

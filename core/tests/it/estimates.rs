@@ -79,7 +79,8 @@ fn adaptive_samples_tell_their_error() {
     check_calibration(&[16.0, 8.0, 4.0, 2.0, 1.0, 0.5].map(adaptive));
 }
 
-/// One sample a pixel, whose error only the neighbours' samples tell; seeds that no factor was fitted to.
+/// One sample a pixel, whose error only the neighbours' samples tell; seeds that no factor was
+/// fitted to.
 #[test]
 fn one_sample_tells_its_error_beside_edges() {
     let pictures = known_pictures(96).into_iter().chain(indirect_pictures(96));

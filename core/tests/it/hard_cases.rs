@@ -410,9 +410,10 @@ fn the_first_wins_of_a_quadrangle_and_triangles_over_it() {
 /// Labels are seen from so far away.
 const LABEL_DISTANCE: f64 = 0.5;
 
-/// A wall and a label on it, in thousandths, so that both are in one plane in decimals. For each unit
-/// of `apart` the label is moved by a rounding: of the coordinates across the plane, or of what a ray
-/// measures if that is more, its own length and its start's distance from the middle of the wall.
+/// A wall and a label on it, in thousandths, so that both are in one plane in decimals. For each
+/// unit of `apart` the label is moved by a rounding: of the coordinates across the plane, or of
+/// what a ray measures if that is more, its own length and its start's distance from the middle of
+/// the wall.
 fn wall_and_label(random: &mut Random, apart: f64) -> ([DVec3; 4], [DVec3; 4]) {
     let whole = |size: f64, random: &mut Random| (random.in_cube() * size).round();
     let place = whole(900.0, random);

@@ -88,8 +88,9 @@ fn mean_and_error(numbers: &[f64]) -> (f64, f64) {
 /// Pixels on a side of what looks at one place: each estimates it independently.
 const SIDE: u64 = 12;
 
-/// The secondary light at a place that `shows` this share of its own light, and its standard
-/// error, and how far the rounding of what is seen may move it. `lights` and `geometry` are scene text; what receives is among the geometry.
+/// The secondary light at a place that `shows` this share of its own light, and its standard error,
+/// and how far the rounding of what is seen may move it. `lights` and `geometry` are scene text;
+/// what receives is among the geometry.
 fn gathered(
     materials: &str,
     lights: &str,

@@ -158,9 +158,9 @@ fn level_wires_are_in_the_adaptive_picture() {
     }
 }
 
-/// Wires between a wall at z = -2 and a lamp that is so far that all of the wall is equally bright: each
-/// is its shadow, moved towards the lamp until the eye does not see it. The text and the area of the
-/// shadows in pixels.
+/// Wires between a wall at z = -2 and a lamp that is so far that all of the wall is equally bright:
+/// each is its shadow, moved towards the lamp until the eye does not see it. The text and the area
+/// of the shadows in pixels.
 fn shading_fan(width: f64) -> (String, f64) {
     let (mut text, mut area) = (String::new(), 0.0);
     for k in 0..12 {
@@ -216,7 +216,8 @@ fn shadows_of_wires_are_in_the_adaptive_picture() {
     check_beyond("shadows of wires of 1/2 to 1/64 pixel are in the adaptive picture", worst);
 }
 
-/// Tells how much is lacking at most of thin things that no beam from the eye meets, and that it is little.
+/// Tells how much is lacking at most of thin things that no beam from the eye meets, and that it is
+/// little.
 fn check_beyond(what: &str, lack: f64) {
     HardCase::ThinBeyond.tell(what, format!("{:.1} % lacks at most", 100.0 * lack));
     assert!(lack < 0.05, "{what}: {lack}");

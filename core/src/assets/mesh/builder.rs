@@ -100,8 +100,8 @@ impl<T: Copy + Into<f64>> MeshBuilder<T> {
         }
     }
 
-    /// Adds all vertices of a file, finite and without negative zeros, to an empty mesh: the index of
-    /// each.
+    /// Adds all vertices of a file, finite and without negative zeros, to an empty mesh: the index
+    /// of each.
     pub(super) fn add_vertices(&mut self, positions: Vec<[T; 3]>) -> Result<Vec<u32>, MeshFault>
     where
         T: Sync,

@@ -20,9 +20,9 @@ pub(super) fn read_obj(text: &[u8]) -> Result<MeshFile, MeshError> {
     read_in_pieces(text, PIECE).map_or_else(|| read_in_order(text), Ok)
 }
 
-/// Reads a file of several pieces on rayon's threads: its vertices, then its faces. `None` where that
-/// would not be all of it, or in another order: a face names a vertex that comes later, or something
-/// is wrong.
+/// Reads a file of several pieces on rayon's threads: its vertices, then its faces. `None` where
+/// that would not be all of it, or in another order: a face names a vertex that comes later, or
+/// something is wrong.
 fn read_in_pieces(text: &[u8], size: usize) -> Option<MeshFile> {
     let pieces = pieces(text, size);
     if pieces.len() == 1 {
@@ -265,8 +265,8 @@ mod tests {
 
     use super::*;
 
-    /// Vertices in turn with faces of all kinds; equal vertices, faces without area and copies among
-    /// them.
+    /// Vertices in turn with faces of all kinds; equal vertices, faces without area and copies
+    /// among them.
     fn text(count: usize) -> String {
         let mut text = String::new();
         for k in 0..count {

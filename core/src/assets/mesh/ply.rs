@@ -49,8 +49,8 @@ pub(super) fn read_ply(bytes: &[u8]) -> Result<MeshFile, MeshError> {
 /// A thread reads so many faces in one go.
 const FACES_AT_ONCE: usize = 1 << 14;
 
-/// Reads a binary file on rayon's threads: vertices of a fixed size, then faces. `None` where the file
-/// has another order, and where something is wrong.
+/// Reads a binary file on rayon's threads: vertices of a fixed size, then faces. `None` where the
+/// file has another order, and where something is wrong.
 fn read_in_pieces<T: Copy + Into<f64> + Send + Sync>(
     header: &Header<'_>,
     bytes: &[u8],
@@ -279,7 +279,8 @@ impl Element<'_> {
         Some((place, self.properties[place].kind))
     }
 
-    /// Finds the number called `name` in a binary element without lists: its first byte, and its type.
+    /// Finds the number called `name` in a binary element without lists: its first byte, and its
+    /// type.
     fn place(&self, name: &[u8]) -> Option<(usize, Number)> {
         let (place, kind) = self.scalar(name)?;
         Some((self.properties[..place].iter().map(|property| property.kind.size()).sum(), kind))
@@ -398,8 +399,8 @@ impl<'t> Body<'t> {
         Some(runs)
     }
 
-    /// Reads so many binary faces, with corners among the file's vertices, which are `numbers` among
-    /// `vertices`.
+    /// Reads so many binary faces, with corners among the file's vertices, which are `numbers`
+    /// among `vertices`.
     fn read_faces<T: Copy + Into<f64>>(
         &mut self,
         element: &Element<'_>,
@@ -523,8 +524,8 @@ impl<'t> Body<'t> {
 mod tests {
     use super::*;
 
-    /// A binary file with vertices of numbers besides, equal ones among them, and faces of three and more
-    /// corners, some of them copies.
+    /// A binary file with vertices of numbers besides, equal ones among them, and faces of three
+    /// and more corners, some of them copies.
     fn file(is_little: bool, last_corner: u32) -> Vec<u8> {
         const VERTICES: u32 = 3000;
         const FACES: u32 = 2 * FACES_AT_ONCE as u32 + 5;

@@ -15,8 +15,8 @@ pub(in crate::render) struct UnseenFaces {
     /// The corners of all faces.
     corners: Vec<Corner>,
     gaps: Vec<Gap>,
-    /// The shares of the pixel that faces cover, away from the eye and towards it, and gaps leave, which
-    /// samples have passed by now.
+    /// The shares of the pixel that faces cover, away from the eye and towards it, and gaps leave,
+    /// which samples have passed by now.
     passed: [f64; 2],
     /// How far, channel by channel, the colour of faces that were too many to be looked at may lie
     /// from that of the pixel; 0 where there were not too many.
@@ -68,7 +68,8 @@ impl UnseenFaces {
         lack * lack * missed(share, count) + self.uncounted_variance(count)
     }
 
-    /// The share of the pixel that all of it covers, 0..=1, and what the mean lacks if no sample meets it.
+    /// The share of the pixel that all of it covers, 0..=1, and what the mean lacks if no sample
+    /// meets it.
     fn share_and_lack(&self) -> (f64, DVec3) {
         let mut shares = [0.0; 2];
         let mut lacks = [DVec3::ZERO; 2];

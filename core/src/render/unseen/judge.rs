@@ -44,8 +44,8 @@ pub(super) struct Judge<'a> {
     clipper: Clipper,
     /// The indices of the outlines that the pixel's samples did not meet.
     suspects: Vec<usize>,
-    /// What was cut out of the first of the faces in a pixel, `None` where nothing is seen of one, and
-    /// the corners of it all.
+    /// What was cut out of the first of the faces in a pixel, `None` where nothing is seen of one,
+    /// and the corners of it all.
     pieces: Vec<Option<Piece>>,
     corners: Vec<Corner>,
 }
@@ -72,9 +72,9 @@ impl<'a> Judge<'a> {
         }
     }
 
-    /// Finds what a pixel may hide among the faces in its beam, in the order of their ranks. `around` are the
-    /// first samples of the pixels beside it that came the same way: those that passed a gap tell what is
-    /// there.
+    /// Finds what a pixel may hide among the faces in its beam, in the order of their ranks.
+    /// `around` are the first samples of the pixels beside it that came the same way: those that
+    /// passed a gap tell what is there.
     pub(super) fn find_unseen<'f>(
         &mut self,
         sight: &Sight<'_>,
@@ -126,8 +126,8 @@ impl<'a> Judge<'a> {
         })
     }
 
-    /// Finds what the face that was seen and those that continue it leave uncovered. `suspects` are all
-    /// faces in the pixel, in the order of their ranks.
+    /// Finds what the face that was seen and those that continue it leave uncovered. `suspects` are
+    /// all faces in the pixel, in the order of their ranks.
     fn find_gap<'f>(
         &mut self,
         sight: &Sight<'_>,
@@ -380,13 +380,13 @@ impl<'a> Judge<'a> {
     }
 }
 
-/// What a pixel's first sample saw, and its plane on the screen. Times the inverse depth the height of a
-/// point over the plane is linear in the place and the inverse depth, so that corners answer for all
-/// between them.
+/// What a pixel's first sample saw, and its plane on the screen. Times the inverse depth the height
+/// of a point over the plane is linear in the place and the inverse depth, so that corners answer
+/// for all between them.
 struct Seen {
     surfel: Surfel,
-    /// The height over a plane through the eye: at the frame's corner, and what a pixel to the right and
-    /// one down add.
+    /// The height over a plane through the eye: at the frame's corner, and what a pixel to the
+    /// right and one down add.
     rows: [f64; 3],
     /// The height of what was seen.
     height: f64,
@@ -425,7 +425,8 @@ impl Seen {
         })
     }
 
-    /// Whether all between these corners is surely so near to the plane that it may continue what was seen.
+    /// Whether all between these corners is surely so near to the plane that it may continue what
+    /// was seen.
     fn is_surely_continued_by(&self, corners: &[Corner]) -> bool {
         corners.iter().all(|&corner| {
             let (height, room) = self.height_of(corner);
@@ -443,8 +444,8 @@ impl Seen {
     }
 }
 
-/// Whether a face that begins at `point` stands behind what was seen: beyond an edge of that it may begin,
-/// but not more than a pixel behind it.
+/// Whether a face that begins at `point` stands behind what was seen: beyond an edge of that it may
+/// begin, but not more than a pixel behind it.
 fn is_behind(sight: &Sight<'_>, point: DVec3, seen: &Surfel) -> bool {
     let pixel_side = sight.screen.pixel_side() * sight.screen.depth(point);
     seen.normal.dot(point - seen.point) < -pixel_side

@@ -5,10 +5,10 @@
 //! [`frustum`] collects the faces in it: boxes are filtered with a margin for rounding, then a
 //! face's own [`outline`] on the screen decides. So what a pixel learns depends neither on the tree
 //! nor on the block. The [`judge`] cuts the outlines to the pixel and keeps those that no sample
-//! has met or passed, and whose colour may lie far enough from what was seen ([`contrast`]), and the
-//! gap that the face that was seen and those beside it leave, whatever stands behind. They
-//! are the pixel's [`UnseenFaces`], and tell how much its mean may lack; later samples take them
-//! out one by one.
+//! has met or passed, and whose colour may lie far enough from what was seen ([`contrast`]), and
+//! the gap that the face that was seen and those beside it leave, whatever stands behind. They are
+//! the pixel's [`UnseenFaces`], and tell how much its mean may lack; later samples take them out
+//! one by one.
 //!
 //! The same search goes on from flat surfaces ([`onward`]): towards the lights, for shadows, into
 //! mirrors and through what does not bend.
@@ -86,8 +86,8 @@ impl<'a> UnseenSearch<'a> {
         self.onward.as_ref().map_or(0, OnwardSearch::rays)
     }
 
-    /// Finds what may hide in the pixels of an area: `on_found` gets each pixel that may hide something.
-    /// `firsts` have the pixels around it, too.
+    /// Finds what may hide in the pixels of an area: `on_found` gets each pixel that may hide
+    /// something. `firsts` have the pixels around it, too.
     pub(super) fn search(
         &mut self,
         area: Area,

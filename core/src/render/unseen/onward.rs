@@ -1,6 +1,6 @@
-//! Beams that flat surfaces send on: towards the lights, whose shadows they show, mirrored, and straight
-//! through what does not bend. As the surface is flat such a beam comes from one point too, so it is
-//! searched like that of the eye, with a screen on which pixels have the same places.
+//! Beams that flat surfaces send on: towards the lights, whose shadows they show, mirrored, and
+//! straight through what does not bend. As the surface is flat such a beam comes from one point
+//! too, so it is searched like that of the eye, with a screen on which pixels have the same places.
 //!
 //! Source: Heckbert & Hanrahan, "Beam Tracing Polygonal Objects" (1984).
 
@@ -30,9 +30,9 @@ use crate::{
     },
 };
 
-/// The sides, in pixels, of the frame's squares that are searched in one go, and how many faces may be
-/// in their beams. Where one of the last size has more nothing is looked for: a light is searched for
-/// shadows in whole squares, so that a pixel finds the same in every tile.
+/// The sides, in pixels, of the frame's squares that are searched in one go, and how many faces may
+/// be in their beams. Where one of the last size has more nothing is looked for: a light is
+/// searched for shadows in whole squares, so that a pixel finds the same in every tile.
 const SQUARES: [(u32, usize); 2] = [(8, 64), (2, 48)];
 
 /// The most faces that one pixel's beam in a mirror or behind a pane is searched for.
@@ -118,8 +118,8 @@ impl<'a> OnwardSearch<'a> {
         self.ray_count
     }
 
-    /// Finds what may hide in the pixels of an area in beams that surfaces send on. `look` tells what a
-    /// pixel's first sample saw, if its beam is to be followed.
+    /// Finds what may hide in the pixels of an area in beams that surfaces send on. `look` tells
+    /// what a pixel's first sample saw, if its beam is to be followed.
     pub(super) fn search(
         &mut self,
         screen: &Screen,
@@ -140,8 +140,8 @@ impl<'a> OnwardSearch<'a> {
         }
     }
 
-    /// Searches the beams that go on from what pixels of a square look at, at surface number `depth` of
-    /// their way.
+    /// Searches the beams that go on from what pixels of a square look at, at surface number
+    /// `depth` of their way.
     fn follow(
         &mut self,
         screen: &Screen,

@@ -223,8 +223,8 @@ pub(super) struct Fragment {
 }
 
 impl Fragment {
-    /// Cuts the outline with these corners and bounds to a pixel and to what is within reach; the fragment's own corners are
-    /// left in `clipper`. It is `None` where nothing is left.
+    /// Cuts the outline with these corners and bounds to a pixel and to what is within reach; the
+    /// fragment's own corners are left in `clipper`. It is `None` where nothing is left.
     pub(super) fn new(
         corners: &[Corner],
         bounds: &Rectangle,
@@ -296,7 +296,8 @@ impl Clipper {
     }
 }
 
-/// Whether a polygon surely fills a rectangle: its edges, lengthened, pass by it and it holds the middle.
+/// Whether a polygon surely fills a rectangle: its edges, lengthened, pass by it and it holds the
+/// middle.
 pub(super) fn fills(polygon: &[Corner], rectangle: &Rectangle) -> bool {
     let Rectangle { low: [x0, y0], high: [x1, y1] } = *rectangle;
     let middle = [x0.midpoint(x1), y0.midpoint(y1)];

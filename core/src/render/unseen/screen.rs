@@ -40,8 +40,8 @@ impl Screen {
         is_finite.then_some(Self { eye, axes, inverse_rows, pixel_side })
     }
 
-    /// The same pixels of a flat surface as a light at `position` sees them: places and the surface's
-    /// depths are those on this screen.
+    /// The same pixels of a flat surface as a light at `position` sees them: places and the
+    /// surface's depths are those on this screen.
     pub(super) fn seen_by_light(&self, sheet: &Sheet, position: DVec3) -> Option<Self> {
         let away = self.eye - position;
         let axes = [0, 1, 2].map(|k| self.axes[k] + sheet.inverse_depth[k] * away);
@@ -157,8 +157,8 @@ impl Reach {
         }
     }
 
-    /// Whether all of a flat polygon, by its corners relative to the eye, that is in a rectangle of the screen
-    /// is surely out of reach.
+    /// Whether all of a flat polygon, by its corners relative to the eye, that is in a rectangle of
+    /// the screen is surely out of reach.
     pub(super) fn surely_misses(
         &self,
         screen: &Screen,
