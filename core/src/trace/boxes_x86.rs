@@ -357,17 +357,19 @@ impl BoxKernel for Avx2Boxes {
             for axis in 0..3 {
                 let near = _mm256_loadu_ps(node.planes[beam.near[axis]].as_ptr());
                 let far = _mm256_loadu_ps(node.planes[beam.far[axis]].as_ptr());
-                let near = _mm256_sub_ps(near, _mm256_set1_ps(beam.near_origin[axis]));
-                let far = _mm256_sub_ps(far, _mm256_set1_ps(beam.far_origin[axis]));
-                let [a, b] = beam.inverse[axis];
-                let a = _mm256_mul_ps(near, _mm256_set1_ps(a));
-                let b = _mm256_mul_ps(near, _mm256_set1_ps(b));
+                let near_origin = _mm256_set1_ps(beam.near_origin[axis]);
+                let far_origin = _mm256_set1_ps(beam.far_origin[axis]);
+                let products = |way, [a, b]: [f32; 2]| {
+                    [_mm256_mul_ps(way, _mm256_set1_ps(a)), _mm256_mul_ps(way, _mm256_set1_ps(b))]
+                };
+                let [a, b] = products(_mm256_sub_ps(near, near_origin), beam.inverse[axis]);
                 enter = _mm256_max_ps(_mm256_min_ps(a, b), enter);
+                // The start that is nearest to a far plane is farthest from a near one.
+                let [a, b] = products(_mm256_sub_ps(near, far_origin), beam.inverse[axis]);
                 all_enter = _mm256_max_ps(_mm256_max_ps(a, b), all_enter);
-                let [a, b] = beam.far_inverse[axis];
-                let a = _mm256_mul_ps(far, _mm256_set1_ps(a));
-                let b = _mm256_mul_ps(far, _mm256_set1_ps(b));
+                let [a, b] = products(_mm256_sub_ps(far, far_origin), beam.far_inverse[axis]);
                 leave = _mm256_min_ps(_mm256_max_ps(a, b), leave);
+                let [a, b] = products(_mm256_sub_ps(far, near_origin), beam.far_inverse[axis]);
                 first_leaves = _mm256_min_ps(_mm256_min_ps(a, b), first_leaves);
             }
             _mm256_storeu_ps(distances.as_mut_ptr(), enter);

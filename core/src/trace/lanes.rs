@@ -404,10 +404,13 @@ pub(super) fn meet_beam(node: &Node, beam: &Beam) -> ([f32; 8], u32, u32) {
             let far = node.planes[beam.far[axis]][child] - beam.far_origin[axis];
             let [a, b] = beam.inverse[axis];
             *enter = larger(smaller(near * a, near * b), *enter);
-            all_enter = larger(larger(near * a, near * b), all_enter);
+            // The start that is nearest to a far plane is farthest from a near one.
+            let last = node.planes[beam.near[axis]][child] - beam.far_origin[axis];
+            all_enter = larger(larger(last * a, last * b), all_enter);
             let [a, b] = beam.far_inverse[axis];
             leave = smaller(larger(far * a, far * b), leave);
-            first_leaves = smaller(smaller(far * a, far * b), first_leaves);
+            let first = node.planes[beam.far[axis]][child] - beam.near_origin[axis];
+            first_leaves = smaller(smaller(first * a, first * b), first_leaves);
         }
         mask |= u32::from(*enter <= leave) << child;
         within |= u32::from(all_enter <= first_leaves) << child;
