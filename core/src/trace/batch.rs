@@ -46,8 +46,8 @@ struct Rooms {
     flights: Option<Box<Flights>>,
     packet: Packet,
     packet_stack: PacketStack,
-    /// The clear faces between rays and their lights: each with its ray's place, its rank and the share
-    /// of light that it lets through.
+    /// The clear faces between rays and their lights: each with its ray's place, its rank and the
+    /// share of light that it lets through.
     clear: Vec<(u16, u32, f64)>,
 }
 

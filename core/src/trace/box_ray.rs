@@ -1,7 +1,7 @@
 //! A ray as a test against boxes needs it.
 //!
-//! Boxes are f32, relative to the scene's f64 frame and rounded outward. Source of the rounding: Ize,
-//! "Robust BVH Ray Traversal" (2013).
+//! Boxes are f32, relative to the scene's f64 frame and rounded outward. Source of the rounding:
+//! Ize, "Robust BVH Ray Traversal" (2013).
 
 use glam::DVec3;
 
@@ -42,7 +42,8 @@ pub(super) const NEAR: f64 = 2.0 * f32::EPSILON as f64;
 /// A ray that starts nearer to its frame than this is taken as it is.
 pub(super) const NEAR_FRAME: f64 = 8.0;
 
-/// How much of the numbers around it a grazed plane's distance may be off: see `docs/proof.md`, boxes.
+/// How much of the numbers around it a grazed plane's distance may be off: see `docs/proof.md`,
+/// boxes.
 const GRAZED: f64 = 1.0 / (1_u64 << 27) as f64;
 
 impl BoxRay {
@@ -97,8 +98,8 @@ impl BoxRay {
             ray.near_origin[axis] = if forward { high } else { low };
             ray.far_origin[axis] = if forward { low } else { high };
         }
-        // A ray that is nowhere, or goes nowhere, meets nothing, above all no boxes of unused children: with a NaN
-        // or an infinity it would.
+        // A ray that is nowhere, or goes nowhere, meets nothing, above all no boxes of unused
+        // children: with a NaN or an infinity it would.
         let is_somewhere = |axis: usize| {
             ray.inverse[axis].abs() > 0.0
                 && ray.near_origin[axis].is_finite()

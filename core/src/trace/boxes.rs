@@ -40,7 +40,8 @@ pub(super) trait BoxKernel: Copy {
         classes
     }
 
-    /// Makes a group of rays of one class. Every number is that of [`BoxRay::new`] and `Shear::new`.
+    /// Makes a group of rays of one class. Every number is that of [`BoxRay::new`] and
+    /// `Shear::new`.
     #[inline(always)]
     fn fill(self, group: &mut RayGroup, rays: [&Ray; LANES], turn: &Turn) {
         lanes::fill(group, rays, turn);
@@ -59,7 +60,8 @@ pub(super) trait BoxKernel: Copy {
     }
 
     /// Which rays of a mask meet the box between three near and three far planes, as
-    /// [`BoxKernel::test`] tells it for each. Of rays from `ONE` start the planes are seen from there.
+    /// [`BoxKernel::test`] tells it for each. Of rays from `ONE` start the planes are seen from
+    /// there.
     #[inline(always)]
     fn enter<const ONE: bool>(
         self,
@@ -70,16 +72,16 @@ pub(super) trait BoxKernel: Copy {
         lanes::enter::<ONE>(groups, planes, mask)
     }
 
-    /// Where the first ray may enter the boxes of a node, those that some ray may meet, a bit each, and those
-    /// that as good as all meet. Rounding keeps order: what a ray computes lies between what the ends of
-    /// the intervals give.
+    /// Where the first ray may enter the boxes of a node, those that some ray may meet, a bit each,
+    /// and those that as good as all meet. Rounding keeps order: what a ray computes lies between
+    /// what the ends of the intervals give.
     #[inline(always)]
     fn meet_beam(self, node: &Node, beam: &Beam) -> ([f32; 8], u32, u32) {
         lanes::meet_beam(node, beam)
     }
 
-    /// How far the lines of some groups' rays pass by a point, in the order of their axes: the greatest
-    /// distance along the first or the second axis.
+    /// How far the lines of some groups' rays pass by a point, in the order of their axes: the
+    /// greatest distance along the first or the second axis.
     #[inline(always)]
     fn spread(self, groups: &[RayGroup], point: &[f64; 3]) -> f64 {
         lanes::spread(groups, point)
@@ -111,8 +113,8 @@ pub(super) trait BoxKernel: Copy {
         lanes::cross(groups, corners, mask, distances)
     }
 
-    /// What one ray is to four triangles, a bit each. Writes the distances of those that it crosses for
-    /// certain, the same to the bit as `hit_triangle`.
+    /// What one ray is to four triangles, a bit each. Writes the distances of those that it crosses
+    /// for certain, the same to the bit as `hit_triangle`.
     #[inline(always)]
     fn cross_four(
         self,

@@ -1,5 +1,5 @@
-//! The kernel with AVX-512: a triangle is tried on eight rays at once. Boxes are AVX2's, eight lanes
-//! of f32.
+//! The kernel with AVX-512: a triangle is tried on eight rays at once. Boxes are AVX2's, eight
+//! lanes of f32.
 
 use std::arch::x86_64::{
     _CMP_GT_OQ, _CMP_LE_OQ, _CMP_LT_OQ, _mm512_abs_pd, _mm512_add_pd, _mm512_cmp_pd_mask,
@@ -19,8 +19,8 @@ use crate::prepared::{
     record::BoxPlanes,
 };
 
-/// The kernel with AVX-512 (F and VL). [`Avx512Boxes::detect`] makes it on CPUs that have these, and
-/// nothing else does.
+/// The kernel with AVX-512 (F and VL). [`Avx512Boxes::detect`] makes it on CPUs that have these,
+/// and nothing else does.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Avx512Boxes(Avx2Boxes);
 

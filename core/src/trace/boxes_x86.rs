@@ -128,8 +128,8 @@ impl BoxKernel for Avx2Boxes {
 
     #[inline(always)]
     fn take_out(self, four: &mut [f64; 4], t: f64, least: &mut [f64; 4]) -> u32 {
-        // SAFETY: a value of this type says that the CPU has AVX2. Loads and stores are of arrays of
-        // exactly 4 numbers.
+        // SAFETY: a value of this type says that the CPU has AVX2. Loads and stores are of arrays
+        // of exactly 4 numbers.
         unsafe {
             let numbers = _mm256_loadu_pd(four.as_ptr());
             let is_taken = _mm256_cmp_pd::<_CMP_EQ_OQ>(numbers, _mm256_set1_pd(t));
@@ -260,8 +260,8 @@ impl BoxKernel for Avx2Boxes {
 
     #[inline(always)]
     fn shorten(self, group: &mut RayGroup, turn: &Turn) {
-        // SAFETY: a value of this type says that the CPU has AVX2. The loads and the store, aligned as
-        // the group is, take arrays of exactly 8 numbers, those of f64 by halves.
+        // SAFETY: a value of this type says that the CPU has AVX2. The loads and the store, aligned
+        // as the group is, take arrays of exactly 8 numbers, those of f64 by halves.
         unsafe {
             let reach = group.reach.as_ptr();
             let reach = [_mm256_load_pd(reach), _mm256_load_pd(reach.add(4))];
@@ -433,8 +433,9 @@ impl BoxKernel for Avx2Boxes {
     #[inline(always)]
     fn spread(self, groups: &[RayGroup], point: &[f64; 3]) -> f64 {
         let mut spread = [0.0; 4];
-        // SAFETY: a value of this type says that the CPU has AVX2. The loads, aligned as the groups are,
-        // take 4 of 8 numbers, from the first or from the fifth on; the store takes an array of exactly 4.
+        // SAFETY: a value of this type says that the CPU has AVX2. The loads, aligned as the groups
+        // are, take 4 of 8 numbers, from the first or from the fifth on; the store takes an array
+        // of exactly 4.
         unsafe {
             let sign = _mm256_set1_pd(-0.0);
             let mut greatest = _mm256_setzero_pd();
@@ -462,8 +463,8 @@ impl BoxKernel for Avx2Boxes {
     fn sieve(self, corners: &[[f64; 3]; 3], focus: &Focus) -> Sieve {
         let mut sieve = Sieve { factors: [[0.0; 4]; 3], bound: 0.0 };
         let mut bounds = [0.0; 4];
-        // SAFETY: a value of this type says that the CPU has AVX2. The stores take arrays of exactly 4
-        // numbers.
+        // SAFETY: a value of this type says that the CPU has AVX2. The stores take arrays of
+        // exactly 4 numbers.
         unsafe {
             let [a, b, c] = corners;
             let zero = _mm256_setzero_pd();
@@ -501,8 +502,8 @@ impl BoxKernel for Avx2Boxes {
     #[inline(always)]
     fn sift(self, groups: &[RayGroup; GROUPS], sieve: &Sieve, mask: u64) -> u64 {
         let mut possible = 0;
-        // SAFETY: a value of this type says that the CPU has AVX2. The loads, aligned as the groups are, read
-        // arrays of exactly 8 floats.
+        // SAFETY: a value of this type says that the CPU has AVX2. The loads, aligned as the groups
+        // are, read arrays of exactly 8 floats.
         unsafe {
             let splat = |factors: &[f32; 4]| {
                 [_mm256_set1_ps(factors[0]), _mm256_set1_ps(factors[1]), _mm256_set1_ps(factors[2])]
@@ -544,8 +545,8 @@ impl BoxKernel for Avx2Boxes {
         let [a, b, c, d] = corners;
         let [x, y, z] = shear.axes;
         assert!(x < 3 && y < 3 && z < 3);
-        // SAFETY: a value of this type says that the CPU has AVX2. A corner has three numbers, and axes
-        // are below 3.
+        // SAFETY: a value of this type says that the CPU has AVX2. A corner has three numbers, and
+        // axes are below 3.
         let [possible, certain] = unsafe {
             let zero = _mm256_setzero_pd();
             let [mut x, mut y, mut z] = [[zero; 3]; 3];
@@ -576,8 +577,8 @@ impl BoxKernel for Avx2Boxes {
 
 #[expect(clippy::unused_self, reason = "a value says that the CPU has the instructions")]
 impl Avx2Boxes {
-    /// What the rays of a mask are to triangles that they see so, four lanes of corners on each axis: those
-    /// that may cross them, and those that do for certain, whose distances are written.
+    /// What the rays of a mask are to triangles that they see so, four lanes of corners on each
+    /// axis: those that may cross them, and those that do for certain, whose distances are written.
     #[inline(always)]
     fn cross_seen(
         self,
@@ -585,8 +586,8 @@ impl Avx2Boxes {
         asking: u64,
         distances: &mut [f64; 4],
     ) -> [u64; 2] {
-        // SAFETY: a value of this type says that the CPU has AVX2. The store takes an array of exactly 4
-        // numbers.
+        // SAFETY: a value of this type says that the CPU has AVX2. The store takes an array of
+        // exactly 4 numbers.
         unsafe {
             let zero = _mm256_setzero_pd();
             let edge = |a: usize, b: usize| {

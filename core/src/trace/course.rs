@@ -53,8 +53,8 @@ pub(super) enum Pin {
     Goal,
 }
 
-/// A ray on its way through a solid. It starts near the solid, wherever the ray does: so rounding is
-/// as fine as the solid.
+/// A ray on its way through a solid. It starts near the solid, wherever the ray does: so rounding
+/// is as fine as the solid.
 pub(super) struct Course<'a> {
     pub(super) view: &'a View<'a>,
     pub(super) solid: &'a SolidRecord,

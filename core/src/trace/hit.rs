@@ -69,8 +69,8 @@ pub(super) fn take_crossing(view: &View<'_>, ray: &Ray, item: Item, t: f64, hit:
     meet_triangle(view, ray, item, t).is_some_and(|met| take(hit, item, met))
 }
 
-/// A ray's line crosses a sphere at two distances, other than its start; whether that is its nearest
-/// hit until now.
+/// A ray's line crosses a sphere at two distances, other than its start; whether that is its
+/// nearest hit until now.
 #[inline(always)]
 pub(super) fn take_sphere(view: &View<'_>, item: Item, ends: [f64; 2], hit: &mut Hit) -> bool {
     let t = first_end(ends);
@@ -120,8 +120,8 @@ fn meet(view: &View<'_>, ray: &Ray, shear: &Shear, item: Item) -> Option<(f64, u
     (t > 0.0).then_some((t, rank, Part::WHOLE))
 }
 
-/// Of the two distances at which a line crosses a sphere, the one at which a ray that starts at 0 first
-/// does; not above 0 if both are behind it.
+/// Of the two distances at which a line crosses a sphere, the one at which a ray that starts at 0
+/// first does; not above 0 if both are behind it.
 #[inline(always)]
 fn first_end([near, far]: [f64; 2]) -> f64 {
     if near > 0.0 { near } else { far }

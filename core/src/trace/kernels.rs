@@ -221,7 +221,8 @@ mod tests {
         nears: [u32; 8],
         crossings: Crossings,
         distances: Vec<Option<u64>>,
-        /// How far the lines pass by the packet's focus, the triangle's sieve and the rays that it lets through.
+        /// How far the lines pass by the packet's focus, the triangle's sieve and the rays that it
+        /// lets through.
         sifted: Option<(u64, Sieve, u64)>,
         shortened: String,
         classes: Vec<u64>,

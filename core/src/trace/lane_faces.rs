@@ -1,5 +1,6 @@
-//! Spheres and quadrangles before a group of rays: loops over lanes in plain Rust, which are compiled
-//! for each instruction set. Every lane computes what the ray alone does, in the same order.
+//! Spheres and quadrangles before a group of rays: loops over lanes in plain Rust, which are
+//! compiled for each instruction set. Every lane computes what the ray alone does, in the same
+//! order.
 
 use super::{
     lanes::{LANES, RayGroup},
@@ -86,8 +87,8 @@ pub(super) fn cross_sphere_again(
     again
 }
 
-/// The rays of a group that leave a surface, a bit each; and those of them that still have the face of
-/// this rank on it ahead of them.
+/// The rays of a group that leave a surface, a bit each; and those of them that still have the face
+/// of this rank on it ahead of them.
 #[inline(always)]
 pub(super) fn leaves(group: &RayGroup, surface: u32, rank: u32) -> (u64, u64) {
     let (mut leaves, mut ahead) = (0, 0);
@@ -98,8 +99,8 @@ pub(super) fn leaves(group: &RayGroup, surface: u32, rank: u32) -> (u64, u64) {
     (leaves, leaves & ahead)
 }
 
-/// `is_inside` for a group of rays and a quadrangle with its corners in the order of the rays' axes:
-/// those that pass inside, and those for which rounded products do not tell.
+/// `is_inside` for a group of rays and a quadrangle with its corners in the order of the rays'
+/// axes: those that pass inside, and those for which rounded products do not tell.
 #[inline(always)]
 pub(super) fn pass_quadrangle(group: &RayGroup, corners: &[[f64; 3]; 4]) -> (u64, u64) {
     let [mut x, mut y] = [[[0.0; LANES]; 4]; 2];
@@ -124,8 +125,8 @@ pub(super) fn pass_quadrangle(group: &RayGroup, corners: &[[f64; 3]; 4]) -> (u64
     (inside, in_doubt)
 }
 
-/// `hit_plane` for a group whose starts have these axes: the rays that do not as good as run along the
-/// plane, a bit each, and their distances from it.
+/// `hit_plane` for a group whose starts have these axes: the rays that do not as good as run along
+/// the plane, a bit each, and their distances from it.
 #[inline(always)]
 pub(super) fn cross_plane(
     group: &RayGroup,

@@ -9,8 +9,8 @@ use crate::{
     prepared::node::{Frame, Node},
 };
 
-/// Rays of one class have the signs of their direction in common, and its largest component. Classes
-/// are numbered from 0 up to this, which is the class of a ray that can be in no packet.
+/// Rays of one class have the signs of their direction in common, and its largest component.
+/// Classes are numbered from 0 up to this, which is the class of a ray that can be in no packet.
 pub(super) const CLASSES: usize = 3 * 8;
 
 /// A direction's component of this size lets the ray move along the axis.
@@ -28,7 +28,8 @@ pub(super) const FACES: usize = 4;
 /// The most rays: a bit each in a mask.
 pub(super) const MOST_RAYS: usize = LANES * GROUPS;
 
-/// What [`LANES`] rays are to boxes, as a `BoxRay` has it, and to flat faces, as a [`Shear`] has it.
+/// What [`LANES`] rays are to boxes, as a `BoxRay` has it, and to flat faces, as a [`Shear`] has
+/// it.
 #[derive(Debug, Clone, Copy)]
 #[repr(C, align(64))]
 pub(super) struct RayGroup {
@@ -135,8 +136,8 @@ impl Beam {
     }
 }
 
-/// A point that the lines of all rays of a packet pass, near enough to tell from it which of them certainly
-/// pass by a triangle: where camera rays start, or where shadow rays end.
+/// A point that the lines of all rays of a packet pass, near enough to tell from it which of them
+/// certainly pass by a triangle: where camera rays start, or where shadow rays end.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Focus {
     /// In the order of the axes of the rays' [`Shear`].
@@ -162,18 +163,19 @@ impl Focus {
 /// See `docs/proof.md`, boxes.
 const BLUR: f64 = 1.0 / (1_u64 << 44) as f64;
 
-/// What decides in f32 whether rays certainly pass by a triangle: twice the areas of (ray, a, b), (ray, b, c)
-/// and (ray, c, a) as a ray through the focus sees them are linear in its slopes.
+/// What decides in f32 whether rays certainly pass by a triangle: twice the areas of (ray, a, b),
+/// (ray, b, c) and (ray, c, a) as a ray through the focus sees them are linear in its slopes.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Sieve {
-    /// The factors of the first slope, of the second one and of 1, for each edge; the last edge is the
-    /// first once more.
+    /// The factors of the first slope, of the second one and of 1, for each edge; the last edge is
+    /// the first once more.
     pub(super) factors: [[f32; 4]; 3],
     /// An area that is further than this from 0 has the sign that `edge` finds.
     pub(super) bound: f32,
 }
 
-/// What f32 rounding takes from twice an area, as a part of its factors: see `docs/proof.md`, boxes.
+/// What f32 rounding takes from twice an area, as a part of its factors: see `docs/proof.md`,
+/// boxes.
 pub(super) const SIEVED: f64 = 8.0 / (1_u64 << 24) as f64;
 
 /// What rays are to a triangle, a bit each.
@@ -183,8 +185,8 @@ pub(super) struct Crossings {
     pub(super) possible: u64,
     /// They cross it for certain, and their distances are known.
     pub(super) certain: u64,
-    /// They do so in front of their starts and within their reach. Of one ray before several triangles
-    /// this is not asked.
+    /// They do so in front of their starts and within their reach. Of one ray before several
+    /// triangles this is not asked.
     pub(super) within: u64,
 }
 
@@ -459,8 +461,8 @@ pub(super) fn cross_four(
     crossings
 }
 
-/// What one ray is to a triangle that it sees so: a bit each. Writes the distance if it crosses it for
-/// certain.
+/// What one ray is to a triangle that it sees so: a bit each. Writes the distance if it crosses it
+/// for certain.
 #[inline(always)]
 fn cross_seen([a, b, c]: &[Projected; 3], distance: &mut f64) -> Crossings {
     let over = [edge(b, c), edge(c, a), edge(a, b)];

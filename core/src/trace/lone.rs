@@ -1,5 +1,6 @@
-//! Rays that go alone: each on its own way through the hierarchy, several by turns, so that what one
-//! fetches is on its way while others are at work, and each on four triangles of a leaf at once.
+//! Rays that go alone: each on its own way through the hierarchy, several by turns, so that what
+//! one fetches is on its way while others are at work, and each on four triangles of a leaf at
+//! once.
 //!
 //! Source of the turns: Kocberber, Falsafi & Grot, "Asynchronous Memory Access Chaining" (2015).
 

@@ -10,16 +10,17 @@ use crate::prepared::record::Item;
 
 /// What is done with what rays meet. A ray is told by its place among those that are under way.
 pub(super) trait Meeting {
-    /// Whether a ray's answer is known as soon as it has met something that counts; else it then only
-    /// reaches less far.
+    /// Whether a ray's answer is known as soon as it has met something that counts; else it then
+    /// only reaches less far.
     const ENDS: bool;
 
-    /// The ray at a place in the packet crosses a triangle at a distance, before or behind its start.
+    /// The ray at a place in the packet crosses a triangle at a distance, before or behind its
+    /// start.
     fn cross(&mut self, place: usize, item: Item, t: f64) -> Step;
 
-    /// The same for rays of a group whose first one is at a place, by a mask of its lanes, and by one of those
-    /// among them that do so in front of their starts and within their reach; which of them have met something
-    /// that counts. Where rays reach less far then, the group knows.
+    /// The same for rays of a group whose first one is at a place, by a mask of its lanes, and by
+    /// one of those among them that do so in front of their starts and within their reach; which of
+    /// them have met something that counts. Where rays reach less far then, the group knows.
     fn cross_group(
         &mut self,
         group: (&mut RayGroup, usize),

@@ -52,7 +52,8 @@ pub(super) struct Packet {
     shortened: u64,
 }
 
-/// Room for children that wait, each with where it begins and the rays that enter it, and for a node.
+/// Room for children that wait, each with where it begins and the rays that enter it, and for a
+/// node.
 #[derive(Debug)]
 pub(super) struct PacketStack([(f32, Child, u64); STACK], Node);
 

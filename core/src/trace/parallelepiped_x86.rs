@@ -66,8 +66,8 @@ fn cross_box_with_sse2(ray: &Ray, left_at: f64, planes: &BoxPlanes) -> ([f64; 2]
     ([enter, leave], least)
 }
 
-/// The operations of `PlaneCrossings`, for four faces at a time: where the line crosses the planes of
-/// `face` and the three after it, and how fast it goes outward there.
+/// The operations of `PlaneCrossings`, for four faces at a time: where the line crosses the planes
+/// of `face` and the three after it, and how fast it goes outward there.
 ///
 /// # Safety
 ///

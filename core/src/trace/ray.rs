@@ -129,8 +129,8 @@ impl Shear {
         }
     }
 
-    /// Projects every vertex. This is a loop, since the closure of a `map` is called where a kernel is compiled for
-    /// an instruction set.
+    /// Projects every vertex. This is a loop, since the closure of a `map` is called where a kernel
+    /// is compiled for an instruction set.
     #[inline(always)]
     pub(super) fn project_all<const N: usize>(&self, vertices: &[[f64; 3]; N]) -> [Projected; N] {
         let mut projected = [Projected { x: 0.0, y: 0.0, z: 0.0 }; N];

@@ -107,7 +107,8 @@ impl Scratch {
         }
     }
 
-    /// Tells of the crossings after `told` and up to `reach` in looks that each take in more leaves.
+    /// Tells of the crossings after `told` and up to `reach` in looks that each take in more
+    /// leaves.
     #[inline(always)]
     fn join_in_looks(
         &mut self,
@@ -290,8 +291,8 @@ impl Scratch {
         self.keep(Stretches { node, join, first: first_end }, count, record, rest);
     }
 
-    /// Keeps so many ends as the stretches of an operation, the last part; if there are none, leaves
-    /// before `rest` make no difference any more.
+    /// Keeps so many ends as the stretches of an operation, the last part; if there are none,
+    /// leaves before `rest` make no difference any more.
     #[inline(always)]
     fn keep(&mut self, part: Stretches, count: usize, record: &SolidNodeRecord, rest: &mut u32) {
         self.ends.truncate(part.first + count);

@@ -10,8 +10,8 @@ use crate::prepared::{
 /// Children that may wait while a ray visits others: seven on each level and the last node's.
 pub(super) const STACK: usize = 7 * MOST_LEVELS + 8;
 
-/// A ray on its way, nearer boxes first, and room for what waits; kept from ray to ray, for to fill it
-/// anew for each would cost as much as the ray.
+/// A ray on its way, nearer boxes first, and room for what waits; kept from ray to ray, for to fill
+/// it anew for each would cost as much as the ray.
 #[derive(Debug)]
 pub(super) struct Traversal {
     pub(super) box_ray: BoxRay,

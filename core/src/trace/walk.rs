@@ -1,8 +1,9 @@
 //! The walk along a ray through a solid of few nodes, from end to end of the leaves' stretches.
 //!
-//! Source: the classification of Roth, "Ray Casting for Modeling Solids" (1982), with a bit for each
-//! node of the tree that the ray is inside. Doubts do not count here: where they might, the walk is
-//! not sure and says so. docs/proof.md says why all others tell what the plain evaluation does.
+//! Source: the classification of Roth, "Ray Casting for Modeling Solids" (1982), with a bit for
+//! each node of the tree that the ray is inside. Doubts do not count here: where they might, the
+//! walk is not sure and says so. docs/proof.md says why all others tell what the plain evaluation
+//! does.
 
 use super::{
     boxes::BoxKernel,
@@ -50,7 +51,8 @@ pub(super) struct Walk {
     /// The leaves that are met, in file order.
     leaves: [u8; MOST_LEAVES],
     /// Where the ray enters and where it leaves each of them, two leaves a row: infinite where that
-    /// does not count, and once it is behind. They are not sorted: most walks end after a few steps.
+    /// does not count, and once it is behind. They are not sorted: most walks end after a few
+    /// steps.
     ends: [[f64; 4]; MOST_LEAVES / 2],
     /// The nodes that the ray is inside.
     inside: u64,
@@ -65,9 +67,10 @@ impl Default for Walk {
 }
 
 impl Walk {
-    /// Calls `take` for the crossings after `told` and up to `reach`, in order, until it says that it
-    /// has enough; `told` follows. `touched` are the leaves that may count, a bit each, of a solid of
-    /// at most [`SolidNodeRecord::BITS`] nodes; it is not sure of more than [`MOST_LEAVES`].
+    /// Calls `take` for the crossings after `told` and up to `reach`, in order, until it says that
+    /// it has enough; `told` follows. `touched` are the leaves that may count, a bit each, of a
+    /// solid of at most [`SolidNodeRecord::BITS`] nodes; it is not sure of more than
+    /// [`MOST_LEAVES`].
     #[inline(always)]
     pub(super) fn tell(
         &mut self,
@@ -193,8 +196,8 @@ impl Walk {
         }
     }
 
-    /// Enters or leaves a node because of an event; that event if the ray crosses the solid's surface
-    /// with it.
+    /// Enters or leaves a node because of an event; that event if the ray crosses the solid's
+    /// surface with it.
     #[inline(always)]
     fn turn_for(&mut self, course: &Course<'_>, change: Change) -> Option<Event> {
         let root = course.nodes.len() as u32 - 1;
@@ -273,9 +276,9 @@ impl Walk {
         }
     }
 
-    /// The event whose face is there if an operation changes because some of its operands did, which
-    /// were turned already, in file order: that of the first that made it change. `siblings` are the
-    /// other operands of the first one.
+    /// The event whose face is there if an operation changes because some of its operands did,
+    /// which were turned already, in file order: that of the first that made it change. `siblings`
+    /// are the other operands of the first one.
     #[inline(always)]
     fn joint_change(
         &self,
