@@ -58,7 +58,8 @@ pub(crate) enum Action {
     /// Answer a question for tiles.
     Answer(AskId, Result<Next, NoMember>),
     /// Write the pixels of a delivery into the picture of a job, then report
-    /// [`Farm::on_stored`] or [`Farm::on_store_failed`].
+    /// [`Farm::on_stored`](super::Farm::on_stored) or
+    /// [`Farm::on_store_failed`](super::Farm::on_store_failed).
     Store(DeliveryId, JobId, TileId),
     /// Answer a delivery.
     Acknowledge(DeliveryId, Verdict),
