@@ -14,7 +14,7 @@ mod verify;
 use std::{
     collections::BTreeSet,
     fs::{self, File},
-    io::{BufRead, BufReader},
+    io::{self, BufRead, BufReader},
     net::{TcpListener, TcpStream},
     path::{Path, PathBuf},
     process::{Child, ChildStdout, Command, ExitStatus, Stdio},
@@ -234,6 +234,24 @@ fn pid(process: u32) -> Pid {
     Pid::from_raw(i32::try_from(process).unwrap()).unwrap()
 }
 
+/// Stops a process, and waits until all its threads stand still: the signal is taken by one of
+/// them, and the others may go on until that one gets a processor.
+fn hold(process: u32) {
+    kill_process(pid(process), Signal::STOP).unwrap();
+    poll(|| {
+        let mut threads = fs::read_dir(format!("/proc/{process}/task")).unwrap();
+        let stands = |thread: io::Result<fs::DirEntry>| {
+            // A thread that is gone meanwhile does nothing, either.
+            let status = fs::read_to_string(thread.unwrap().path().join("stat"));
+            status
+                .unwrap_or_default()
+                .rsplit_once(") ")
+                .is_none_or(|(_, rest)| rest.starts_with('T'))
+        };
+        threads.all(stands).then_some(())
+    });
+}
+
 /// Waits until a process is gone or waits only to be reaped.
 fn wait_for_end_of(process: u32) {
     poll(|| {
@@ -341,7 +359,7 @@ fn a_killed_and_a_stopped_worker_change_nothing() {
     poll(|| (render.tiles_done() >= 10 && render.workers().len() == 3).then_some(()));
     let workers = render.workers();
     kill_process(pid(workers[0].1), Signal::KILL).unwrap();
-    kill_process(pid(workers[1].1), Signal::STOP).unwrap();
+    hold(workers[1].1);
     // The others stand still as well until that one is found out, or they might have done all by
     // then.
     let mut resting = BTreeSet::from([workers[0].1, workers[1].1]);
@@ -480,7 +498,7 @@ fn a_coordinator_killed_and_started_again_gives_the_next_picture_no_pixel_of_the
     poll(|| (first.tiles_done() >= 20 && first.workers().len() == 3).then_some(()));
     // Each has tiles in hand that it brings once it goes on.
     for worker in &workers {
-        worker.signal(Signal::STOP);
+        hold(worker.child.id());
     }
     first.signal(Signal::KILL);
     first.wait();
@@ -655,7 +673,7 @@ fn an_interrupted_render_leaves_nothing() {
         poll(|| (render.tiles_done() >= 3).then_some(()));
         let workers = render.workers();
         if let Some(&(_, stopped)) = workers.first() {
-            kill_process(pid(stopped), Signal::STOP).unwrap();
+            hold(stopped);
         }
         render.signal(signal);
         assert_eq!(render.wait().code(), Some(130), "{}", render.log());
@@ -676,7 +694,7 @@ fn workers_die_with_a_killed_coordinator() {
     let mut render = place.start("render.log", &args);
     poll(|| (render.tiles_done() >= 1 && render.workers().len() == 2).then_some(()));
     let workers = render.workers();
-    kill_process(pid(workers[0].1), Signal::STOP).unwrap();
+    hold(workers[0].1);
     render.signal(Signal::KILL);
     render.wait();
     for (_, process) in workers {
@@ -693,7 +711,7 @@ fn a_worker_that_stays_stopped_is_replaced() {
     let args = [&["render", "scene.rt", "-o", "out.png", "--workers", "1"], &ENDLESS[..]].concat();
     let mut render = place.start("render.log", &args);
     poll(|| (render.tiles_done() >= 1).then_some(()));
-    kill_process(pid(render.workers()[0].1), Signal::STOP).unwrap();
+    hold(render.workers()[0].1);
     poll(|| (render.workers().len() == 2).then_some(()));
     render.signal(Signal::INT);
     assert_eq!(render.wait().code(), Some(130));
@@ -920,7 +938,7 @@ fn a_second_interruption_ends_a_submit_at_once() {
     let mut submit = place.start_by(&debug, "submit.log", &args);
     // It has its job and watches it.
     poll(|| submit.log().contains("progress").then_some(()));
-    coordinator.signal(Signal::STOP);
+    hold(coordinator.child.id());
     submit.signal(Signal::INT);
     thread::sleep(Duration::from_millis(300));
     assert!(submit.child.try_wait().unwrap().is_none(), "it tells the farm, which does not listen");
