@@ -11,7 +11,10 @@ use clap::{Arg, Args as ClapArgs, CommandFactory, FromArgMatches, Parser, Subcom
 use rtfarm_core::render::StandardError;
 use rtfarm_ladder::Effort;
 
-use self::values::{parse_error, parse_seconds, whole_number};
+use self::{
+    farm::LogArgs,
+    values::{parse_error, parse_seconds, whole_number},
+};
 use crate::{
     frames::FrameRange,
     slurm::{Host, SbatchOptions},
@@ -315,9 +318,8 @@ pub(crate) struct RenderArgs {
     #[arg(long, help_heading = TALK)]
     pub(crate) preview: bool,
 
-    /// How log lines are written.
-    #[arg(long, value_name = "FORMAT", default_value = "text", help_heading = TALK)]
-    pub(crate) log_format: LogFormat,
+    #[command(flatten)]
+    pub(crate) log: LogArgs,
 }
 
 impl Args {
@@ -366,10 +368,10 @@ impl Command {
     /// How log lines are written.
     pub(crate) fn log_format(&self) -> LogFormat {
         match self {
-            Self::Render(args) => args.log_format,
-            Self::Coordinator(args) => args.log_format,
-            Self::Worker(args) => args.log_format,
-            Self::Submit(args) => args.log_format,
+            Self::Render(args) => args.log.format,
+            Self::Coordinator(args) => args.log.format,
+            Self::Worker(args) => args.log.format,
+            Self::Submit(args) => args.log.format,
             _ => LogFormat::Text,
         }
     }

@@ -515,7 +515,7 @@ impl Render<'_> {
                 coordinator: Address::Unix(socket),
                 threads,
                 isa: args.isa.0,
-                log_format: args.log_format,
+                log_format: args.log.format,
             };
             let children = Children::start(workers, setup, self.console);
             Crew::Local(children.context("cannot start workers")?)

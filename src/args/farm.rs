@@ -150,9 +150,15 @@ pub(crate) struct CoordinatorArgs {
     #[arg(long, value_name = "FRACTION", default_value = "0.01", value_parser = parse_fraction, env = "RTFARM_AUDIT", help_heading = WORK)]
     pub(crate) audit: f64,
 
+    #[command(flatten)]
+    pub(crate) log: LogArgs,
+}
+
+#[derive(Debug, ClapArgs)]
+pub(crate) struct LogArgs {
     /// How log lines are written.
-    #[arg(long, value_name = "FORMAT", default_value = "text", env = "RTFARM_LOG_FORMAT", help_heading = TALK)]
-    pub(crate) log_format: LogFormat,
+    #[arg(long = "log-format", value_name = "FORMAT", default_value = "text", env = "RTFARM_LOG_FORMAT", help_heading = TALK)]
+    pub(crate) format: LogFormat,
 }
 
 #[derive(Debug, ClapArgs)]
@@ -182,9 +188,8 @@ pub(crate) struct WorkerArgs {
     #[arg(long, value_name = "S", default_value = "10", value_parser = parse_seconds, env = "RTFARM_GRACE", help_heading = WORK)]
     pub(crate) grace: Duration,
 
-    /// How log lines are written.
-    #[arg(long, value_name = "FORMAT", default_value = "text", env = "RTFARM_LOG_FORMAT", help_heading = TALK)]
-    pub(crate) log_format: LogFormat,
+    #[command(flatten)]
+    pub(crate) log: LogArgs,
 
     /// Live no longer than this process, which has started this one.
     #[arg(long, hide = true)]

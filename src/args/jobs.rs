@@ -7,9 +7,9 @@ use rtfarm_coordinator::Owner;
 
 use super::{
     FARM, TALK,
-    farm::AccessArgs,
+    farm::{AccessArgs, LogArgs},
     picture::PictureArgs,
-    values::{LogFormat, number, parse_seconds, whole_number},
+    values::{number, parse_seconds, whole_number},
 };
 
 #[derive(Debug, ClapArgs)]
@@ -54,9 +54,8 @@ pub(crate) struct SubmitArgs {
     #[arg(long, value_name = "S", default_value = "60", value_parser = parse_seconds, env = "RTFARM_PATIENCE", help_heading = FARM)]
     pub(crate) patience: Duration,
 
-    /// How log lines are written.
-    #[arg(long, value_name = "FORMAT", default_value = "text", env = "RTFARM_LOG_FORMAT", help_heading = TALK)]
-    pub(crate) log_format: LogFormat,
+    #[command(flatten)]
+    pub(crate) log: LogArgs,
 }
 
 /// Which farm is asked, and how it is told.
