@@ -20,8 +20,8 @@ impl Effort {
     pub fn reach(self) -> Reach {
         match self {
             Self::Smoke => Reach { rungs: 3, seeds: 2 },
-            Self::Quick => Reach { rungs: 6, seeds: 8 },
-            Self::Full => Reach { rungs: 8, seeds: 16 },
+            Self::Quick => Reach { rungs: 9, seeds: 8 },
+            Self::Full => Reach { rungs: 11, seeds: 16 },
         }
     }
 

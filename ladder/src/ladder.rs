@@ -138,9 +138,9 @@ impl Ladder {
         reach: Reach,
         go_on: &(impl Fn() -> ControlFlow<()> + Sync),
     ) -> Option<Self> {
-        let fixed = (0..reach.rungs).map(|rung| Sampling::fixed(8 << rung).expect("few enough"));
-        // Over one range however many there are: 16 to 0.5 steps of 8 bits.
-        let finest = 10;
+        let fixed = (0..reach.rungs).map(|rung| Sampling::fixed(1 << rung).expect("few enough"));
+        // Over one range however many there are: 32 to 0.5 steps of 8 bits.
+        let finest = 12;
         let last = reach.rungs.max(2) - 1;
         let adaptive =
             (0..reach.rungs).filter_map(|rung| adaptive_settings().nth(rung * finest / last));

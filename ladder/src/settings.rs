@@ -8,11 +8,11 @@ use rtfarm_core::{
 /// The adaptive settings from coarse to fine: each asks for an error smaller by √2 than the one
 /// before. Below an 8-bit step pixels may have more samples as well.
 pub fn adaptive_settings() -> impl Iterator<Item = Sampling> {
-    (0..=22).map(|rung: u32| {
+    (0..=24).map(|rung: u32| {
         let halves = f64::from(1_u32 << (rung / 2));
         let half = if rung.is_multiple_of(2) { 1.0 } else { std::f64::consts::SQRT_2 };
-        let error = 16.0 * StandardError::EIGHT_BIT_STEP.get() / (halves * half);
-        let most = SampleLimit::DEFAULT.get() << rung.saturating_sub(8).min(8);
+        let error = 32.0 * StandardError::EIGHT_BIT_STEP.get() / (halves * half);
+        let most = SampleLimit::DEFAULT.get() << rung.saturating_sub(10).min(8);
         Sampling::adaptive(error, most.min(MOST_SAMPLES)).expect("both are in range")
     })
 }

@@ -55,7 +55,9 @@ pub fn table(ladder: &Ladder) -> String {
         text += &row(rung);
     }
     for series in &ladder.series {
-        let points = series.rungs.iter().map(|rung| (rung.time(), rung.rmse().0));
+        // One sample lies in the pixel's middle, two or more anywhere in it: another law.
+        let rungs = series.rungs.iter().filter(|rung| rung.samples_a_pixel != Some(1.0));
+        let points = rungs.map(|rung| (rung.time(), rung.rmse().0));
         if let Some(slope) = slope(points) {
             let _ = writeln!(text, "\nRMSE falls as time^{slope:.2} ({}).", series.name);
         }

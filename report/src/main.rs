@@ -85,14 +85,14 @@ impl Plan {
                 reach,
                 kernels: Amount { rays: 20_000, exact: 100, textbook: 2_000, runs: 9 },
                 peers_width: 128,
-                peers_reach: Reach { rungs: 6, seeds: 9 },
+                peers_reach: Reach { rungs: 9, seeds: 9 },
             },
             Effort::Full => Self {
                 width: 96,
                 reach,
                 kernels: Amount { rays: 200_000, exact: 2_000, textbook: 20_000, runs: 15 },
                 peers_width: 256,
-                peers_reach: Reach { rungs: 6, seeds: 9 },
+                peers_reach: Reach { rungs: 9, seeds: 9 },
             },
         }
     }

@@ -74,20 +74,18 @@ fn summary(ladders: &[Ladder]) -> String {
         let _ = writeln!(text, "| {name} | {fixed} | {adaptive} |");
     }
     text += "\n## Adaptive against fixed samples\n\nAt the RMSE of an adaptive setting, how many \
-             times its time and its samples a fixed number takes.\n\n| scene | setting | time | samples |\n|---|---|---|---|\n";
+             times its time and its samples a fixed number takes; `<` where one sample in the \
+             pixel's middle is better already.\n\n| scene | setting | time | samples |\n|---|---|---|---|\n";
     for ladder in ladders {
         for rung in ladder.adaptive() {
-            let at = |cost: &dyn Fn(&Rung) -> f64| at_rmse(ladder.fixed(), rung.rmse().0, cost);
             let samples_of = |rung: &Rung| rung.samples_a_pixel.unwrap_or(0.0);
-            if let (Some(time), Some(samples)) = (at(&Rung::time), at(&samples_of)) {
-                let _ = writeln!(
-                    text,
-                    "| {} | {} | {:.1} | {:.1} |",
-                    ladder.name,
-                    rung.setting,
-                    time / rung.time(),
-                    samples / samples_of(rung)
-                );
+            let ratio = |cost: &dyn Fn(&Rung) -> f64| {
+                let least = at_rmse(ladder.fixed(), rung.rmse().0, cost)?;
+                Some(least.told(|of_fixed| format!("{:.1}", of_fixed / cost(rung))))
+            };
+            if let (Some(time), Some(samples)) = (ratio(&Rung::time), ratio(&samples_of)) {
+                let _ =
+                    writeln!(text, "| {} | {} | {time} | {samples} |", ladder.name, rung.setting);
             }
         }
     }
@@ -132,25 +130,39 @@ fn peers(ladders: &[Ladder]) -> String {
 }
 
 fn time_to(rungs: &[Rung], wanted: f64) -> String {
-    if rungs[0].rmse().0 <= wanted {
-        let (time, digits) = (rungs[0].time(), decimals(rungs[0].time()));
-        return format!("< {time:.digits$}");
-    }
-    at_rmse(rungs, wanted, &Rung::time).map_or("-".to_owned(), |time| {
-        let digits = decimals(time);
-        format!("{time:.digits$}")
+    at_rmse(rungs, wanted, &Rung::time).map_or("-".to_owned(), |least| {
+        least.told(|time| format!("{time:.digits$}", digits = decimals(time)))
     })
 }
 
-/// What rungs that get better and better cost at an error between theirs, along the line through
-/// the two beside it in logarithms; `None` outside them.
+/// What it costs to come to an error.
+enum Cost {
+    /// Of the first rung, which comes to less.
+    Below(f64),
+    Of(f64),
+}
+
+impl Cost {
+    fn told(&self, tell: impl Fn(f64) -> String) -> String {
+        match *self {
+            Self::Below(cost) => format!("< {}", tell(cost)),
+            Self::Of(cost) => tell(cost),
+        }
+    }
+}
+
+/// What rungs cost at an error between theirs, along the line through the first two that have it
+/// between them, in logarithms; `None` where none comes to it.
 #[expect(clippy::disallowed_methods, reason = "a table's figure reaches no pixel")]
-fn at_rmse(rungs: &[Rung], wanted: f64, cost: &dyn Fn(&Rung) -> f64) -> Option<f64> {
+fn at_rmse(rungs: &[Rung], wanted: f64, cost: &dyn Fn(&Rung) -> f64) -> Option<Cost> {
     let rmse = |rung: &Rung| rung.rmse().0;
+    if let Some(first) = rungs.first().filter(|first| rmse(first) <= wanted) {
+        return Some(Cost::Below(cost(first)));
+    }
     rungs.windows(2).find(|pair| rmse(&pair[0]) >= wanted && rmse(&pair[1]) <= wanted).map(|pair| {
         let [before, after] = [rmse(&pair[0]), rmse(&pair[1])];
         let part = (before / wanted).ln() / (before / after).ln().max(f64::MIN_POSITIVE);
-        cost(&pair[0]) * (cost(&pair[1]) / cost(&pair[0])).powf(part)
+        Cost::Of(cost(&pair[0]) * (cost(&pair[1]) / cost(&pair[0])).powf(part))
     })
 }
 

@@ -108,6 +108,7 @@ impl LaneWork for InLanes<'_> {
 
 impl InLanes<'_> {
     /// Tells the pixels from (x, y) to the right.
+    #[expect(clippy::needless_bitwise_bool, reason = "lanes have no branches")]
     #[inline(always)]
     fn tell(&mut self, x: u32, y: u32) {
         let Wanted { error, full_light } = *self.wanted;
@@ -123,12 +124,12 @@ impl InLanes<'_> {
             }
             for lane in 0..AT_ONCE {
                 let colors: [f64; NINE] = std::array::from_fn(|k| nine[k][lane]);
-                let low = colors.iter().copied().fold(f64::INFINITY, f64::min);
-                let contrast = colors.iter().copied().fold(f64::NEG_INFINITY, f64::max) - low;
+                let low = colors.iter().copied().fold(f64::INFINITY, least);
+                let contrast = colors.iter().copied().fold(f64::NEG_INFINITY, most) - low;
                 contrasts[channel][lane] = contrast;
                 edges[channel][lane] = colors.iter().fold(true, |is_edge, color| {
-                    let inside = (color - low).min(low + contrast - color);
-                    is_edge && SHADES * inside <= contrast
+                    let inside = least(color - low, low + contrast - color);
+                    is_edge & (SHADES * inside <= contrast)
                 });
                 variances[channel][lane] = variance_about_plane(&colors);
             }
@@ -166,6 +167,16 @@ impl InLanes<'_> {
             };
         }
     }
+}
+
+#[inline(always)]
+fn least(a: f64, b: f64) -> f64 {
+    if a < b { a } else { b }
+}
+
+#[inline(always)]
+fn most(a: f64, b: f64) -> f64 {
+    if a > b { a } else { b }
 }
 
 /// How far nine samples, row by row, lie from the plane that fits them best, as [`Neighbourhood`]
