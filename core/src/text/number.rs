@@ -61,6 +61,22 @@ pub(crate) fn scan_number_without_comment(text: &[u8], at: &mut usize) -> Option
     (text.get(*at) != Some(&b'#')).then_some(number)
 }
 
+/// Rounds the number that `word` spells to single precision; `double` is the same number rounded to
+/// f64. It is infinite when it is beyond f32.
+///
+/// Numbers halfway between two singles are doubles, so a double that is none lies on the side of
+/// each of them on which the number itself lies, and rounds to the same single. Source of the pitfall:
+/// Figueroa, "When Is Double Rounding Innocuous?" (1995).
+pub(crate) fn round_to_single(double: f64, word: &[u8]) -> Option<f32> {
+    // A single keeps 24 of the 53 bits; below the normal ones it keeps fewer.
+    let is_halfway = double.to_bits() & ((1 << 29) - 1) == 1 << 28;
+    if is_halfway || double.abs() < f64::from(f32::MIN_POSITIVE) {
+        let single: f32 = fast_float2::parse(word).ok()?;
+        return Some(single + 0.0);
+    }
+    Some(double as f32)
+}
+
 fn is_end(byte: u8) -> bool {
     matches!(class(byte), Class::Space | Class::Comment)
 }
@@ -115,6 +131,46 @@ mod tests {
             "nan",
         ] {
             check_scan(text);
+        }
+    }
+
+    #[test]
+    fn singles_are_rounded_once() {
+        let check = |word: &str| {
+            let double = parse_number(word.as_bytes()).unwrap();
+            let single: f32 = fast_float2::parse(word).unwrap();
+            let found = round_to_single(double, word.as_bytes()).unwrap();
+            assert_eq!(found.to_bits(), (single + 0.0).to_bits(), "{word}");
+        };
+        // Just above and just below halfway by less than f64 tells, and at the ends of the range.
+        for word in [
+            "1.000000059604644775390625",
+            "1.0000000596046447753906250000001",
+            "1.0000000596046447753906249999999",
+            "-1.0000000596046447753906250000001",
+            "1.1754943508222875e-38",
+            "1.1754943157898258e-38",
+            "7.0064923216240853546186479164495e-46",
+            "7.0064923216240853546186479164497e-46",
+            "1e-60",
+            "-1e-60",
+            "0",
+            "-0",
+            "3.4028235677973366e38",
+            "3.4028235677973365e38",
+            "1e39",
+        ] {
+            check(word);
+        }
+        let mut state = 1_u64;
+        for _ in 0..20_000 {
+            state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1);
+            // Halfway or beside it.
+            let single = f64::from(f32::from_bits((state >> 33) as u32 & 0x7f7f_ffff));
+            let near = f64::from_bits(single.to_bits() + (1 << 28) + (state >> 20) % 3 - 1);
+            check(&format!("{near:e}"));
+            check(&format!("{near:.30e}"));
+            check(&format!("{single:e}"));
         }
     }
 
