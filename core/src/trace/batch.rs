@@ -193,7 +193,7 @@ impl KernelWork<View<'_>> for Trace<'_> {
             let hits = &mut self.hits[first..];
             let order = Order::new(kernel, rays, view);
             for members in order.packets() {
-                packet.fill(kernel, &view.header.frame, rays, members);
+                packet.fill(kernel, &view.header.frame, rays, (members, false));
                 let scratch = &mut *scratch;
                 let mut meeting = NearestOfPacket { view, kernel, rays, members, hits, scratch };
                 visit_packet(kernel, view, packet, (packet_stack, stack), &mut meeting);
@@ -251,7 +251,7 @@ impl<K: BoxKernel> Meeting for NearestOfPacket<'_, K> {
         for lane in places(within) {
             let t = distances[lane % LANES];
             let hit = &mut self.hits[usize::from(self.members[first + lane])];
-            let leaves = group.leaving[lane % LANES] as u32 == rank;
+            let leaves = group.leaving[lane % LANES] == rank;
             if !leaves && take(hit, item, (t, rank, Part::WHOLE)) {
                 group.reach[lane % LANES] = t;
                 counts |= 1 << lane;
@@ -259,6 +259,14 @@ impl<K: BoxKernel> Meeting for NearestOfPacket<'_, K> {
         }
         counts
     }
+
+    #[inline(always)]
+    fn wall(&self, _item: Item) -> Option<u32> {
+        None
+    }
+
+    #[inline(always)]
+    fn stop(&mut self, _stopped: u64) {}
 
     #[inline(always)]
     fn is_plain(&self, _item: Item) -> bool {
@@ -317,7 +325,7 @@ impl KernelWork<View<'_>> for Shadows<'_> {
             let shades = Shades { ending_on: self.ending_on, has_clear, shares, clear };
             let mut meeting = BlockedOfPacket { view, kernel, rays, members: &[], scratch, shades };
             for members in order.packets() {
-                packet.fill(kernel, &view.header.frame, rays, members);
+                packet.fill(kernel, &view.header.frame, rays, (members, !has_clear));
                 meeting.members = members;
                 visit_packet(kernel, view, packet, (packet_stack, stack), &mut meeting);
             }
@@ -408,13 +416,26 @@ impl<K: BoxKernel> Meeting for BlockedOfPacket<'_, K> {
         }
         let rank = self.view.faces[item.index()].rank();
         for lane in places(within) {
-            let leaves = group.leaving[lane % LANES] as u32 == rank;
+            let leaves = group.leaving[lane % LANES] == rank;
             if !leaves && distances[lane % LANES] < group.reach[lane % LANES] {
                 self.shades.shares[usize::from(self.members[first + lane])] = 0.0;
                 counts |= 1 << lane;
             }
         }
         counts
+    }
+
+    #[inline(always)]
+    fn wall(&self, item: Item) -> Option<u32> {
+        let is_wall = item.kind() == Some(Kind::Triangle) && !self.shades.has_clear;
+        (is_wall && self.is_plain(item)).then(|| self.view.faces[item.index()].rank())
+    }
+
+    #[inline(always)]
+    fn stop(&mut self, stopped: u64) {
+        for place in places(stopped) {
+            self.shades.shares[usize::from(self.members[place])] = 0.0;
+        }
     }
 
     #[inline(always)]

@@ -11,6 +11,7 @@ use super::{
     box_ray::BoxRay,
     boxes::{BoxKernel, KernelWork},
     boxes_x86::Avx2Boxes,
+    gate::{Gate, Way},
     lanes::{Beam, Crossings, FACES, Focus, GROUPS, LANES, RayGroup, Sieve, Turn},
     ray::{Ray, Shear},
 };
@@ -113,8 +114,23 @@ impl BoxKernel for Avx512Boxes {
     }
 
     #[inline(always)]
-    fn sift(self, groups: &[RayGroup; GROUPS], sieve: &Sieve, mask: u64) -> u64 {
-        self.0.sift(groups, sieve, mask)
+    fn sift<const CERTAIN: bool>(
+        self,
+        groups: &[RayGroup; GROUPS],
+        sieve: &Sieve,
+        mask: u64,
+    ) -> [u64; 2] {
+        self.0.sift::<CERTAIN>(groups, sieve, mask)
+    }
+
+    #[inline(always)]
+    fn find_ends(self, groups: &mut [RayGroup], focus: &Focus, axis: usize) -> Way {
+        self.0.find_ends(groups, focus, axis)
+    }
+
+    #[inline(always)]
+    fn pass_gate(self, groups: &[RayGroup; GROUPS], gate: &Gate, mask: u64) -> [u64; 2] {
+        self.0.pass_gate(groups, gate, mask)
     }
 
     #[inline(always)]

@@ -6,12 +6,13 @@ use std::arch::x86_64::{
     _mm_min_ps, _mm_min_ss, _mm_movehdup_ps, _mm_movehl_ps, _mm_movemask_ps, _mm_mul_ps,
     _mm_prefetch, _mm_set1_ps, _mm_setzero_ps, _mm_storeu_ps, _mm_sub_ps, _mm256_add_epi32,
     _mm256_add_pd, _mm256_add_ps, _mm256_and_pd, _mm256_and_ps, _mm256_and_si256, _mm256_andnot_pd,
-    _mm256_blendv_pd, _mm256_castpd_ps, _mm256_castpd_si256, _mm256_castps_si256,
-    _mm256_castps256_ps128, _mm256_castsi256_pd, _mm256_castsi256_ps, _mm256_cmp_pd, _mm256_cmp_ps,
-    _mm256_cvtpd_ps, _mm256_cvtps_pd, _mm256_div_pd, _mm256_extractf128_ps, _mm256_load_pd,
-    _mm256_load_ps, _mm256_loadu_pd, _mm256_loadu_ps, _mm256_max_pd, _mm256_max_ps, _mm256_min_pd,
-    _mm256_min_ps, _mm256_movemask_pd, _mm256_movemask_ps, _mm256_mul_pd, _mm256_mul_ps,
-    _mm256_or_pd, _mm256_or_si256, _mm256_permute2f128_pd, _mm256_permute4x64_epi64,
+    _mm256_andnot_ps, _mm256_blendv_pd, _mm256_castpd_ps, _mm256_castpd_si256, _mm256_castps_pd,
+    _mm256_castps_si256, _mm256_castps256_ps128, _mm256_castsi256_pd, _mm256_castsi256_ps,
+    _mm256_cmp_pd, _mm256_cmp_ps, _mm256_cmpeq_epi32, _mm256_cvtpd_ps, _mm256_cvtps_pd,
+    _mm256_div_pd, _mm256_extractf128_ps, _mm256_load_pd, _mm256_load_ps, _mm256_loadu_pd,
+    _mm256_loadu_ps, _mm256_max_pd, _mm256_max_ps, _mm256_min_pd, _mm256_min_ps,
+    _mm256_movemask_pd, _mm256_movemask_ps, _mm256_mul_pd, _mm256_mul_ps, _mm256_or_pd,
+    _mm256_or_ps, _mm256_or_si256, _mm256_permute2f128_pd, _mm256_permute4x64_epi64,
     _mm256_permute4x64_pd, _mm256_set_m128, _mm256_set1_epi32, _mm256_set1_epi64x, _mm256_set1_pd,
     _mm256_set1_ps, _mm256_setr_pd, _mm256_setzero_pd, _mm256_shuffle_ps, _mm256_srai_epi32,
     _mm256_store_pd, _mm256_store_ps, _mm256_storeu_pd, _mm256_storeu_ps, _mm256_storeu_si256,
@@ -21,6 +22,7 @@ use std::arch::x86_64::{
 use super::{
     box_ray::{BoxRay, FAR, NEAR, NEAR_FRAME},
     boxes::{BoxKernel, KernelWork},
+    gate::{Gate, Way},
     lanes::{
         Beam, CLASSES, Crossings, FACES, Focus, GROUPS, LANES, LEAST_COMPONENT, RayGroup, SIEVED,
         Sieve, Turn, bounded,
@@ -236,8 +238,6 @@ impl BoxKernel for Avx2Boxes {
                 for axis in 0..3 {
                     store(&mut group.direction[axis], numbers[3 + axis]);
                 }
-                let leaving = group.leaving.as_mut_ptr().add(4 * half);
-                _mm256_store_pd(leaving.cast(), numbers[7]);
                 let depth = numbers[3 + z];
                 store(&mut group.origin[0], numbers[x]);
                 store(&mut group.origin[1], numbers[y]);
@@ -253,6 +253,13 @@ impl BoxKernel for Avx2Boxes {
                 let both = _mm256_set_m128(_mm256_cvtpd_ps(high), _mm256_cvtpd_ps(low));
                 _mm256_store_ps(rounded.as_mut_ptr(), both);
             }
+            let [low, high] = [halves[0][7], halves[1][7]].map(|half| _mm256_castpd_ps(half));
+            let even = _mm256_castps_pd(_mm256_shuffle_ps::<0x88>(low, high));
+            let odd = _mm256_castps_pd(_mm256_shuffle_ps::<0xDD>(low, high));
+            let (leaving, after) =
+                (_mm256_permute4x64_pd::<0xD8>(even), _mm256_permute4x64_pd::<0xD8>(odd));
+            _mm256_store_pd(group.leaving.as_mut_ptr().cast(), leaving);
+            _mm256_store_pd(group.after.as_mut_ptr().cast(), after);
             let high = self.high(&halves.map(|numbers| numbers[6]), &turn.reach);
             _mm256_store_ps(group.high.as_mut_ptr(), high);
         }
@@ -500,8 +507,13 @@ impl BoxKernel for Avx2Boxes {
     }
 
     #[inline(always)]
-    fn sift(self, groups: &[RayGroup; GROUPS], sieve: &Sieve, mask: u64) -> u64 {
-        let mut possible = 0;
+    fn sift<const CERTAIN: bool>(
+        self,
+        groups: &[RayGroup; GROUPS],
+        sieve: &Sieve,
+        mask: u64,
+    ) -> [u64; 2] {
+        let [mut possible, mut certain] = [0; 2];
         // SAFETY: a value of this type says that the CPU has AVX2. The loads, aligned as the groups
         // are, read arrays of exactly 8 floats.
         unsafe {
@@ -530,9 +542,96 @@ impl BoxKernel for Avx2Boxes {
                 let is_above = _mm256_cmp_ps::<_CMP_GT_OQ>(most, above);
                 let past = _mm256_movemask_ps(_mm256_and_ps(is_below, is_above)) as u64;
                 possible |= (asking & !past) << (LANES * k);
+                if CERTAIN {
+                    let is_inside = _mm256_or_ps(
+                        _mm256_cmp_ps::<_CMP_LT_OQ>(most, below),
+                        _mm256_cmp_ps::<_CMP_GT_OQ>(least, above),
+                    );
+                    let inside = _mm256_movemask_ps(is_inside) as u64;
+                    certain |= (asking & inside) << (LANES * k);
+                }
             }
         }
-        possible
+        [possible, certain]
+    }
+
+    #[inline(always)]
+    fn find_ends(self, groups: &mut [RayGroup], focus: &Focus, axis: usize) -> Way {
+        let forward = 1.0_f64.copysign(groups[0].direction[axis][0]);
+        let mut longest = [0.0; 4];
+        // SAFETY: a value of this type says that the CPU has AVX2. The loads and stores, aligned
+        // as the groups are, take arrays of exactly 8 numbers, those of f64 by halves; the last
+        // store takes an array of exactly 4.
+        unsafe {
+            let sign = _mm256_set1_pd(-0.0);
+            let mut greatest = _mm256_setzero_pd();
+            for group in groups {
+                let mut ends = [[greatest; 2]; 2];
+                for half in 0..2 {
+                    let load = |lanes: &[f64; LANES]| _mm256_load_pd(lanes.as_ptr().add(4 * half));
+                    let start =
+                        _mm256_sub_pd(load(&group.origin[2]), _mm256_set1_pd(focus.point[2]));
+                    let start = _mm256_mul_pd(_mm256_set1_pd(forward), start);
+                    let ahead = _mm256_andnot_pd(sign, load(&group.direction[axis]));
+                    let length = _mm256_mul_pd(load(&group.reach), ahead);
+                    let length = _mm256_min_pd(length, _mm256_set1_pd(2.0 * focus.most));
+                    let end = _mm256_add_pd(start, length);
+                    let (near, far) = (_mm256_andnot_pd(sign, start), _mm256_andnot_pd(sign, end));
+                    greatest = _mm256_max_pd(_mm256_max_pd(near, far), greatest);
+                    (ends[0][half], ends[1][half]) = (start, end);
+                }
+                for (rounded, [low, high]) in group.ends.iter_mut().zip(ends) {
+                    let both = _mm256_set_m128(_mm256_cvtpd_ps(high), _mm256_cvtpd_ps(low));
+                    _mm256_store_ps(rounded.as_mut_ptr(), both);
+                }
+            }
+            _mm256_storeu_pd(longest.as_mut_ptr(), greatest);
+        }
+        let [a, b, c, d] = longest;
+        Way { forward, longest: a.max(b).max(c.max(d)) }
+    }
+
+    #[inline(always)]
+    fn pass_gate(self, groups: &[RayGroup; GROUPS], gate: &Gate, mask: u64) -> [u64; 2] {
+        let [mut between, mut outside] = [0; 2];
+        // SAFETY: a value of this type says that the CPU has AVX2. The loads, aligned as the groups
+        // are, read arrays of exactly 8 numbers of 32 bits, any of which is a float.
+        unsafe {
+            let [x, y, z] = gate.normal;
+            let [x, y, z] = [_mm256_set1_ps(x), _mm256_set1_ps(y), _mm256_set1_ps(z)];
+            let height = _mm256_set1_ps(gate.height);
+            let (below, above) = (_mm256_set1_ps(-gate.bound), _mm256_set1_ps(gate.bound));
+            let surface = _mm256_set1_epi32(gate.surface.cast_signed());
+            let mut left = mask;
+            while left != 0 {
+                let k = left.trailing_zeros() as usize / LANES % GROUPS;
+                let asking = left >> (LANES * k) & 0xFF;
+                left &= !(0xFF << (LANES * k));
+                let group = &groups[k];
+                let load = |lanes: &[f32; LANES]| _mm256_load_ps(lanes.as_ptr());
+                let [right, up] = [load(&group.rounded_slopes[0]), load(&group.rounded_slopes[1])];
+                let slope = _mm256_add_ps(z, _mm256_mul_ps(right, x));
+                let slope = _mm256_add_ps(slope, _mm256_mul_ps(up, y));
+                let start = _mm256_sub_ps(height, _mm256_mul_ps(load(&group.ends[0]), slope));
+                let end = _mm256_sub_ps(height, _mm256_mul_ps(load(&group.ends[1]), slope));
+                let (least, most) = (_mm256_min_ps(start, end), _mm256_max_ps(start, end));
+                let is_between = _mm256_and_ps(
+                    _mm256_cmp_ps::<_CMP_LT_OQ>(least, below),
+                    _mm256_cmp_ps::<_CMP_GT_OQ>(most, above),
+                );
+                let is_outside = _mm256_or_ps(
+                    _mm256_cmp_ps::<_CMP_GT_OQ>(least, above),
+                    _mm256_cmp_ps::<_CMP_LT_OQ>(most, below),
+                );
+                let surfaces = _mm256_load_ps(group.leaving.as_ptr().cast());
+                let leaves = _mm256_cmpeq_epi32(_mm256_castps_si256(surfaces), surface);
+                let is_outside = _mm256_or_ps(is_outside, _mm256_castsi256_ps(leaves));
+                let passed = _mm256_movemask_ps(_mm256_andnot_ps(is_outside, is_between)) as u64;
+                between |= (passed & asking) << (LANES * k);
+                outside |= (_mm256_movemask_ps(is_outside) as u64 & asking) << (LANES * k);
+            }
+        }
+        [between, outside]
     }
 
     #[inline(always)]
