@@ -119,6 +119,16 @@ impl Order {
     fn new(kernel: impl BoxKernel, rays: &[Ray], view: &View<'_>) -> Self {
         let frame = &view.header.frame;
         let fewest = if view.faces.len() < DEEP { FEWEST_RAYS } else { FEWEST_IN_DEPTH };
+        let all_of = |class: u64| {
+            let mut ends = [0; CLASSES + 1];
+            ends[class as usize..].fill(rays.len() as u16);
+            Self { places: IN_ORDER, ends }
+        };
+        if rays.len() >= fewest
+            && let Some(class) = kernel.common_class(rays, frame)
+        {
+            return all_of(class);
+        }
         let mut classes = [0; RAYS_A_REPORT];
         for (classes, rays) in classes.as_chunks_mut().0.iter_mut().zip(rays.chunks(4)) {
             let mut four = [&rays[0]; 4];
@@ -128,9 +138,7 @@ impl Order {
         let classes = &classes[..rays.len()];
         let differences = classes.iter().fold(0, |all, class| all | (class ^ classes[0]));
         if differences == 0 && rays.len() >= fewest {
-            let mut ends = [0; CLASSES + 1];
-            ends[classes[0] as usize..].fill(rays.len() as u16);
-            return Self { places: IN_ORDER, ends };
+            return all_of(classes[0]);
         }
         let mut ends = [0; CLASSES + 1];
         for &class in classes {

@@ -41,6 +41,12 @@ pub(super) trait BoxKernel: Copy {
         classes
     }
 
+    /// The class that rays have in common, where that can be told at once.
+    #[inline(always)]
+    fn common_class(self, _rays: &[Ray], _frame: &Frame) -> Option<u64> {
+        None
+    }
+
     /// Makes a group of rays of one class. Every number is that of [`BoxRay::new`] and
     /// `Shear::new`.
     #[inline(always)]

@@ -74,6 +74,11 @@ impl BoxKernel for Avx512Boxes {
     }
 
     #[inline(always)]
+    fn common_class(self, rays: &[Ray], frame: &Frame) -> Option<u64> {
+        self.0.common_class(rays, frame)
+    }
+
+    #[inline(always)]
     fn fill(self, group: &mut RayGroup, rays: [&Ray; LANES], turn: &Turn) {
         self.0.fill(group, rays, turn);
     }

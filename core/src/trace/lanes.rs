@@ -1,13 +1,10 @@
 //! Rays side by side, a lane each, and the tests that several of them take at once.
 
 use super::{
-    box_ray::{BoxRay, FAR, NEAR_FRAME},
+    box_ray::{BoxRay, FAR, LEAST_SLACK, NEAR_FRAME, SLACK},
     ray::{Projected, Ray, Shear, depth_axis, edge},
 };
-use crate::{
-    exact::float::{above, below},
-    prepared::node::{Frame, Node},
-};
+use crate::prepared::node::{Frame, Node};
 
 /// Rays of one class have the signs of their direction in common, and its largest component.
 /// Classes are numbered from 0 up to this, which is the class of a ray that can be in no packet.
@@ -258,7 +255,9 @@ pub(super) fn fill(group: &mut RayGroup, rays: [&Ray; LANES], turn: &Turn) {
     for (lane, ray) in rays.into_iter().enumerate() {
         for axis in 0..3 {
             let relative = (ray.origin[axis] - turn.frame.origin[axis]) * turn.frame.scale;
-            let (low, high) = (below(relative), above(relative));
+            let place = relative as f32;
+            let slack = SLACK * place.abs() + LEAST_SLACK;
+            let (low, high) = (place - slack, place + slack);
             let (near, far) = if turn.is_forward[axis] { (high, low) } else { (low, high) };
             group.near_origin[axis][lane] = near;
             group.far_origin[axis][lane] = far;

@@ -102,13 +102,18 @@ impl Packet {
         self.alive = u64::MAX >> (MOST_RAYS - members.len());
         self.turn = Turn::new(&rays[usize::from(members[0])], frame);
         let count = members.len().div_ceil(LANES);
-        for (group, members) in self.groups.iter_mut().zip(members.chunks(LANES)) {
+        let (full, rest) = members.as_chunks::<LANES>();
+        let mut padded = [0; LANES];
+        if let Some(last) = rest.last() {
             // Lanes without a ray have the last one.
-            let last = members.len() - 1;
-            let mut of_lanes = [&rays[usize::from(members[last])]; LANES];
-            for (of_lane, &member) in of_lanes.iter_mut().zip(members) {
-                *of_lane = &rays[usize::from(member)];
-            }
+            padded = [*last; LANES];
+            padded[..rest.len()].copy_from_slice(rest);
+        }
+        let rest = (!rest.is_empty()).then_some(&padded);
+        for (group, members) in self.groups.iter_mut().zip(full.iter().chain(rest)) {
+            let [a, b, c, d, e, f, g, h] = *members;
+            let ray = |member: u16| &rays[usize::from(member)];
+            let of_lanes = [ray(a), ray(b), ray(c), ray(d), ray(e), ray(f), ray(g), ray(h)];
             kernel.fill(group, of_lanes, &self.turn);
         }
         let groups = &self.groups[..count];
