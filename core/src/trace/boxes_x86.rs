@@ -29,9 +29,12 @@ use super::{
     parallelepiped_x86,
     ray::{Ray, Shear},
 };
-use crate::prepared::{
-    node::{Frame, Node},
-    record::BoxPlanes,
+use crate::{
+    isa::Isa,
+    prepared::{
+        node::{Frame, Node},
+        record::BoxPlanes,
+    },
 };
 
 /// The kernel with SSE2, four boxes at a time. Every x86-64 CPU has it.
@@ -90,20 +93,20 @@ fn prefetch<T>(place: &T) {
 }
 
 /// The kernel with AVX2, all eight boxes at once. [`Avx2Boxes::detect`] makes it on CPUs that have
-/// AVX2, and nothing else does.
+/// all of [`Isa::Avx2`], and nothing else does.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Avx2Boxes(());
 
 impl Avx2Boxes {
     /// `None` on a CPU without AVX2.
     pub(super) fn detect() -> Option<Self> {
-        std::arch::is_x86_feature_detected!("avx2").then_some(Self(()))
+        Isa::Avx2.is_supported().then_some(Self(()))
     }
 }
 
 impl BoxKernel for Avx2Boxes {
     fn run<Input>(self, input: &Input, work: &mut impl KernelWork<Input>) {
-        #[target_feature(enable = "avx2")]
+        #[target_feature(enable = "avx2,bmi1,bmi2,lzcnt,popcnt")]
         fn run_compiled_for_avx2<Input>(
             kernel: Avx2Boxes,
             input: &Input,
@@ -111,7 +114,7 @@ impl BoxKernel for Avx2Boxes {
         ) {
             work.run(input, kernel);
         }
-        // SAFETY: a value of this type says that the CPU has AVX2.
+        // SAFETY: a value of this type says that the CPU has AVX2 and the others.
         unsafe { run_compiled_for_avx2(self, input, work) }
     }
 
@@ -288,9 +291,9 @@ impl BoxKernel for Avx2Boxes {
             let (near, far) = (splat(near), splat(far));
             let mut left = mask;
             while left != 0 {
-                let k = left.trailing_zeros() as usize / LANES % GROUPS;
-                let (group, asking) = (&groups[k], left >> (LANES * k) & 0xFF);
-                left &= !(0xFF << (LANES * k));
+                let first = left.trailing_zeros() as usize & (MOST_RAYS - LANES);
+                let group = &groups[first / LANES];
+                left &= !(0xFF << first);
                 let mut enter = _mm256_set1_ps(-0.0);
                 let mut leave = _mm256_load_ps(group.high.as_ptr());
                 for axis in 0..3 {
@@ -305,10 +308,10 @@ impl BoxKernel for Avx2Boxes {
                     leave = _mm256_min_ps(to_far, leave);
                 }
                 let is_met = _mm256_cmp_ps::<_CMP_LE_OQ>(enter, leave);
-                met |= (_mm256_movemask_ps(is_met) as u64 & asking) << (LANES * k);
+                met |= (_mm256_movemask_ps(is_met) as u64) << first;
             }
         }
-        met
+        met & mask
     }
 
     #[inline(always)]
@@ -472,7 +475,7 @@ impl BoxKernel for Avx2Boxes {
         sieve: &Sieve,
         mask: u64,
     ) -> [u64; 2] {
-        let [mut possible, mut certain] = [0; 2];
+        let [mut past, mut certain] = [0; 2];
         // SAFETY: a value of this type says that the CPU has AVX2. The loads, aligned as the groups
         // are, read arrays of exactly 8 floats.
         unsafe {
@@ -484,10 +487,9 @@ impl BoxKernel for Avx2Boxes {
             let (below, above) = (_mm256_set1_ps(-sieve.bound), _mm256_set1_ps(sieve.bound));
             let mut left = mask;
             while left != 0 {
-                let k = left.trailing_zeros() as usize / LANES % GROUPS;
-                let asking = left >> (LANES * k) & 0xFF;
-                left &= !(0xFF << (LANES * k));
-                let [right, up] = &groups[k].rounded_slopes;
+                let start = left.trailing_zeros() as usize & (MOST_RAYS - LANES);
+                left &= !(0xFF << start);
+                let [right, up] = &groups[start / LANES].rounded_slopes;
                 let right = _mm256_load_ps(right.as_ptr());
                 let up = _mm256_load_ps(up.as_ptr());
                 let area = |edge: usize| {
@@ -499,19 +501,18 @@ impl BoxKernel for Avx2Boxes {
                 let most = _mm256_max_ps(areas[0], _mm256_max_ps(areas[1], areas[2]));
                 let is_below = _mm256_cmp_ps::<_CMP_LT_OQ>(least, below);
                 let is_above = _mm256_cmp_ps::<_CMP_GT_OQ>(most, above);
-                let past = _mm256_movemask_ps(_mm256_and_ps(is_below, is_above)) as u64;
-                possible |= (asking & !past) << (LANES * k);
+                let is_past = _mm256_and_ps(is_below, is_above);
+                past |= (_mm256_movemask_ps(is_past) as u64) << start;
                 if CERTAIN {
                     let is_inside = _mm256_or_ps(
                         _mm256_cmp_ps::<_CMP_LT_OQ>(most, below),
                         _mm256_cmp_ps::<_CMP_GT_OQ>(least, above),
                     );
-                    let inside = _mm256_movemask_ps(is_inside) as u64;
-                    certain |= (asking & inside) << (LANES * k);
+                    certain |= (_mm256_movemask_ps(is_inside) as u64) << start;
                 }
             }
         }
-        [possible, certain]
+        [mask & !past, mask & certain]
     }
 
     #[inline(always)]
@@ -562,10 +563,9 @@ impl BoxKernel for Avx2Boxes {
             let surface = _mm256_set1_epi32(gate.surface.cast_signed());
             let mut left = mask;
             while left != 0 {
-                let k = left.trailing_zeros() as usize / LANES % GROUPS;
-                let asking = left >> (LANES * k) & 0xFF;
-                left &= !(0xFF << (LANES * k));
-                let group = &groups[k];
+                let first = left.trailing_zeros() as usize & (MOST_RAYS - LANES);
+                left &= !(0xFF << first);
+                let group = &groups[first / LANES];
                 let load = |lanes: &[f32; LANES]| _mm256_load_ps(lanes.as_ptr());
                 let [right, up] = [load(&group.rounded_slopes[0]), load(&group.rounded_slopes[1])];
                 let slope = _mm256_add_ps(z, _mm256_mul_ps(right, x));
@@ -585,11 +585,11 @@ impl BoxKernel for Avx2Boxes {
                 let leaves = _mm256_cmpeq_epi32(_mm256_castps_si256(surfaces), surface);
                 let is_outside = _mm256_or_ps(is_outside, _mm256_castsi256_ps(leaves));
                 let passed = _mm256_movemask_ps(_mm256_andnot_ps(is_outside, is_between)) as u64;
-                between |= (passed & asking) << (LANES * k);
-                outside |= (_mm256_movemask_ps(is_outside) as u64 & asking) << (LANES * k);
+                between |= passed << first;
+                outside |= (_mm256_movemask_ps(is_outside) as u64) << first;
             }
         }
-        [between, outside]
+        [mask & between, mask & outside]
     }
 
     #[inline(always)]
