@@ -526,8 +526,8 @@ impl BoxKernel for Avx2Boxes {
             let sign = _mm256_set1_pd(-0.0);
             let mut greatest = _mm256_setzero_pd();
             for group in groups {
-                let mut ends = [[greatest; 2]; 2];
-                for half in 0..2 {
+                let [mut starts, mut goals] = [[greatest; 2]; 2];
+                for (half, (at_start, at_end)) in starts.iter_mut().zip(&mut goals).enumerate() {
                     let load = |lanes: &[f64; LANES]| _mm256_load_pd(lanes.as_ptr().add(4 * half));
                     let start =
                         _mm256_sub_pd(load(&group.origin[2]), _mm256_set1_pd(focus.point[2]));
@@ -538,9 +538,9 @@ impl BoxKernel for Avx2Boxes {
                     let end = _mm256_add_pd(start, length);
                     let (near, far) = (_mm256_andnot_pd(sign, start), _mm256_andnot_pd(sign, end));
                     greatest = _mm256_max_pd(_mm256_max_pd(near, far), greatest);
-                    (ends[0][half], ends[1][half]) = (start, end);
+                    (*at_start, *at_end) = (start, end);
                 }
-                for (rounded, [low, high]) in group.ends.iter_mut().zip(ends) {
+                for (rounded, [low, high]) in group.ends.iter_mut().zip([starts, goals]) {
                     _mm256_store_ps(rounded.as_mut_ptr(), self.single(low, high));
                 }
             }
