@@ -19,7 +19,7 @@ pub(super) struct Way {
 /// height - z (n · slopes) tells.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Gate {
-    /// Twice the area long, in the order of the axes of the rays' [`Shear`].
+    /// Twice the area long, in the order of the axes of the rays' `Shear`.
     pub(super) normal: [f32; 3],
     /// How far the plane is in front of the focus, on the way of the rays, times the normal's
     /// length.
