@@ -119,6 +119,16 @@ impl Order {
     fn new(kernel: impl BoxKernel, rays: &[Ray], view: &View<'_>) -> Self {
         let frame = &view.header.frame;
         let fewest = if view.faces.len() < DEEP { FEWEST_RAYS } else { FEWEST_IN_DEPTH };
+        let all_of = |class: u64| {
+            let mut ends = [0; CLASSES + 1];
+            ends[class as usize..].fill(rays.len() as u16);
+            Self { places: IN_ORDER, ends }
+        };
+        if rays.len() >= fewest
+            && let Some(class) = kernel.common_class(rays, frame)
+        {
+            return all_of(class);
+        }
         let mut classes = [0; RAYS_A_REPORT];
         for (classes, rays) in classes.as_chunks_mut().0.iter_mut().zip(rays.chunks(4)) {
             let mut four = [&rays[0]; 4];
@@ -128,9 +138,7 @@ impl Order {
         let classes = &classes[..rays.len()];
         let differences = classes.iter().fold(0, |all, class| all | (class ^ classes[0]));
         if differences == 0 && rays.len() >= fewest {
-            let mut ends = [0; CLASSES + 1];
-            ends[classes[0] as usize..].fill(rays.len() as u16);
-            return Self { places: IN_ORDER, ends };
+            return all_of(classes[0]);
         }
         let mut ends = [0; CLASSES + 1];
         for &class in classes {
@@ -193,7 +201,7 @@ impl KernelWork<View<'_>> for Trace<'_> {
             let hits = &mut self.hits[first..];
             let order = Order::new(kernel, rays, view);
             for members in order.packets() {
-                packet.fill(kernel, &view.header.frame, rays, members);
+                packet.fill(kernel, &view.header.frame, rays, (members, false));
                 let scratch = &mut *scratch;
                 let mut meeting = NearestOfPacket { view, kernel, rays, members, hits, scratch };
                 visit_packet(kernel, view, packet, (packet_stack, stack), &mut meeting);
@@ -251,7 +259,7 @@ impl<K: BoxKernel> Meeting for NearestOfPacket<'_, K> {
         for lane in places(within) {
             let t = distances[lane % LANES];
             let hit = &mut self.hits[usize::from(self.members[first + lane])];
-            let leaves = group.leaving[lane % LANES] as u32 == rank;
+            let leaves = group.leaving[lane % LANES] == rank;
             if !leaves && take(hit, item, (t, rank, Part::WHOLE)) {
                 group.reach[lane % LANES] = t;
                 counts |= 1 << lane;
@@ -259,6 +267,14 @@ impl<K: BoxKernel> Meeting for NearestOfPacket<'_, K> {
         }
         counts
     }
+
+    #[inline(always)]
+    fn wall(&self, _item: Item) -> Option<u32> {
+        None
+    }
+
+    #[inline(always)]
+    fn stop(&mut self, _stopped: u64) {}
 
     #[inline(always)]
     fn is_plain(&self, _item: Item) -> bool {
@@ -317,7 +333,7 @@ impl KernelWork<View<'_>> for Shadows<'_> {
             let shades = Shades { ending_on: self.ending_on, has_clear, shares, clear };
             let mut meeting = BlockedOfPacket { view, kernel, rays, members: &[], scratch, shades };
             for members in order.packets() {
-                packet.fill(kernel, &view.header.frame, rays, members);
+                packet.fill(kernel, &view.header.frame, rays, (members, !has_clear));
                 meeting.members = members;
                 visit_packet(kernel, view, packet, (packet_stack, stack), &mut meeting);
             }
@@ -408,13 +424,26 @@ impl<K: BoxKernel> Meeting for BlockedOfPacket<'_, K> {
         }
         let rank = self.view.faces[item.index()].rank();
         for lane in places(within) {
-            let leaves = group.leaving[lane % LANES] as u32 == rank;
+            let leaves = group.leaving[lane % LANES] == rank;
             if !leaves && distances[lane % LANES] < group.reach[lane % LANES] {
                 self.shades.shares[usize::from(self.members[first + lane])] = 0.0;
                 counts |= 1 << lane;
             }
         }
         counts
+    }
+
+    #[inline(always)]
+    fn wall(&self, item: Item) -> Option<u32> {
+        let is_wall = item.kind() == Some(Kind::Triangle) && !self.shades.has_clear;
+        (is_wall && self.is_plain(item)).then(|| self.view.faces[item.index()].rank())
+    }
+
+    #[inline(always)]
+    fn stop(&mut self, stopped: u64) {
+        for place in places(stopped) {
+            self.shades.shares[usize::from(self.members[place])] = 0.0;
+        }
     }
 
     #[inline(always)]

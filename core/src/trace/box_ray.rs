@@ -36,8 +36,16 @@ pub(super) struct BoxRay {
 /// of the f64 tests, which is 2^29 times finer.
 pub(super) const FAR: f32 = 1.0 + 4.0 * f32::EPSILON;
 
-/// Three f32 roundings may move a near plane by 1.5 ulp away: so much more is within reach.
-pub(super) const NEAR: f64 = 2.0 * f32::EPSILON as f64;
+/// Three f32 roundings may move a near plane by 1.5 ulp away: so much more is within reach, with
+/// what rounding to f32 and adding this takes.
+pub(super) const NEAR: f32 = 4.0 * f32::EPSILON;
+
+/// A start that is rounded to f32 is moved by this part of it, which is more than rounding took,
+/// and by [`LEAST_SLACK`].
+pub(super) const SLACK: f32 = 2.0 * f32::EPSILON;
+
+/// Covers numbers that are too small for f32.
+pub(super) const LEAST_SLACK: f32 = 1e-25;
 
 /// A ray that starts nearer to its frame than this is taken as it is.
 pub(super) const NEAR_FRAME: f64 = 8.0;
@@ -89,7 +97,9 @@ impl BoxRay {
             let still = d[axis].abs() < 1e-30;
             let blur = if still { 1e-25 } else { blur };
             let inverse = if still { f64::INFINITY.copysign(d[axis]) } else { 1.0 / d[axis] };
-            let (low, high) = (below(o[axis] - blur), above(o[axis] + blur));
+            let place = o[axis] as f32;
+            let slack = SLACK * place.abs() + (1.000_001 * blur + f64::from(LEAST_SLACK)) as f32;
+            let (low, high) = (place - slack, place + slack);
             let forward = inverse > 0.0;
             ray.inverse[axis] = inverse as f32;
             ray.far_inverse[axis] = ray.inverse[axis] * FAR;
@@ -133,7 +143,7 @@ impl BoxRay {
         for axis in 0..3 {
             // More than rounding to f32 takes, without a look at how it rounds.
             let place = relative[axis] as f32;
-            let slack = 2.0 * f32::EPSILON * place.abs() + 1e-25;
+            let slack = SLACK * place.abs() + LEAST_SLACK;
             let (low, high) = (place - slack, place + slack);
             let forward = ray.near[axis] == axis;
             ray.near_origin[axis] = if forward { high } else { low };
@@ -154,8 +164,8 @@ impl BoxRay {
     /// How far a ray that ends at `t` reaches in the boxes' frame.
     #[inline(always)]
     pub(super) fn reach(&self, t: f64) -> f32 {
-        let reach = (t - self.start) * self.scale + self.slack;
-        above(reach + reach.abs() * NEAR)
+        let reach = ((t - self.start) * self.scale + self.slack) as f32;
+        reach + reach.abs() * NEAR
     }
 
     /// Where a box that begins at `near` begins along the ray, within rounding.

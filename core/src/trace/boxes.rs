@@ -6,6 +6,7 @@
 
 use super::{
     box_ray::BoxRay,
+    gate::{self, Gate, Way},
     lanes::{
         self, Beam, Crossings, FACES, Focus, GROUPS, LANES, RayGroup, Sieve, Turn, larger, smaller,
     },
@@ -38,6 +39,12 @@ pub(super) trait BoxKernel: Copy {
             *class = lanes::class_of(ray, frame);
         }
         classes
+    }
+
+    /// The class that rays have in common, where that can be told at once.
+    #[inline(always)]
+    fn common_class(self, _rays: &[Ray], _frame: &Frame) -> Option<u64> {
+        None
     }
 
     /// Makes a group of rays of one class. Every number is that of [`BoxRay::new`] and
@@ -93,10 +100,29 @@ pub(super) trait BoxKernel: Copy {
         lanes::sieve(corners, focus)
     }
 
-    /// The rays of a mask that do not certainly pass by the triangle of a sieve.
+    /// The rays of a mask that do not certainly pass by the triangle of a sieve, and, if that is
+    /// asked, those whose lines certainly cross it.
     #[inline(always)]
-    fn sift(self, groups: &[RayGroup; GROUPS], sieve: &Sieve, mask: u64) -> u64 {
-        lanes::sift(groups, sieve, mask)
+    fn sift<const CERTAIN: bool>(
+        self,
+        groups: &[RayGroup; GROUPS],
+        sieve: &Sieve,
+        mask: u64,
+    ) -> [u64; 2] {
+        lanes::sift::<CERTAIN>(groups, sieve, mask)
+    }
+
+    /// Finds where rays of one class start and end; `axis` is their depth axis.
+    #[inline(always)]
+    fn find_ends(self, groups: &mut [RayGroup], focus: &Focus, axis: usize) -> Way {
+        gate::find_ends(groups, focus, axis)
+    }
+
+    /// The rays of a mask that certainly cross the triangle of a gate between their ends if their
+    /// lines cross it, and those that certainly do not.
+    #[inline(always)]
+    fn pass_gate(self, groups: &[RayGroup; GROUPS], gate: &Gate, mask: u64) -> [u64; 2] {
+        gate::pass_gate(groups, gate, mask)
     }
 
     /// What the rays of a mask are to a triangle; its corners are in the order of the rays' axes.

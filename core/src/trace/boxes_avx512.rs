@@ -1,17 +1,20 @@
-//! The kernel with AVX-512: a triangle is tried on eight rays at once. Boxes are AVX2's, eight
-//! lanes of f32.
+//! The kernel with AVX-512: a triangle is tried on eight rays at once, its sieve on 16. Boxes are
+//! AVX2's, eight lanes of f32.
 
 use std::arch::x86_64::{
-    _CMP_GT_OQ, _CMP_LE_OQ, _CMP_LT_OQ, _mm512_abs_pd, _mm512_add_pd, _mm512_cmp_pd_mask,
-    _mm512_div_pd, _mm512_load_pd, _mm512_max_pd, _mm512_min_pd, _mm512_mul_pd, _mm512_set1_pd,
-    _mm512_setzero_pd, _mm512_storeu_pd, _mm512_sub_pd,
+    _CMP_GT_OQ, _CMP_LE_OQ, _CMP_LT_OQ, _mm256_castps_pd, _mm256_load_ps, _mm512_abs_pd,
+    _mm512_add_pd, _mm512_add_ps, _mm512_castpd_ps, _mm512_castpd256_pd512, _mm512_cmp_pd_mask,
+    _mm512_cmp_ps_mask, _mm512_div_pd, _mm512_insertf64x4, _mm512_load_pd, _mm512_mask_cmp_ps_mask,
+    _mm512_max_pd, _mm512_max_ps, _mm512_min_pd, _mm512_min_ps, _mm512_mul_pd, _mm512_mul_ps,
+    _mm512_set1_pd, _mm512_set1_ps, _mm512_setzero_pd, _mm512_storeu_pd, _mm512_sub_pd,
 };
 
 use super::{
     box_ray::BoxRay,
     boxes::{BoxKernel, KernelWork},
     boxes_x86::Avx2Boxes,
-    lanes::{Beam, Crossings, FACES, Focus, GROUPS, LANES, RayGroup, Sieve, Turn},
+    gate::{Gate, Way},
+    lanes::{Beam, Crossings, FACES, Focus, GROUPS, LANES, MOST_RAYS, RayGroup, Sieve, Turn},
     ray::{Ray, Shear},
 };
 use crate::prepared::{
@@ -35,7 +38,7 @@ impl Avx512Boxes {
 
 impl BoxKernel for Avx512Boxes {
     fn run<Input>(self, input: &Input, work: &mut impl KernelWork<Input>) {
-        #[target_feature(enable = "avx2,avx512f,avx512vl")]
+        #[target_feature(enable = "avx2,bmi1,bmi2,lzcnt,popcnt,avx512f,avx512vl")]
         fn run_compiled_for_avx512<Input>(
             kernel: Avx512Boxes,
             input: &Input,
@@ -70,6 +73,11 @@ impl BoxKernel for Avx512Boxes {
     #[inline(always)]
     fn classify(self, rays: [&Ray; 4], frame: &Frame) -> [u64; 4] {
         self.0.classify(rays, frame)
+    }
+
+    #[inline(always)]
+    fn common_class(self, rays: &[Ray], frame: &Frame) -> Option<u64> {
+        self.0.common_class(rays, frame)
     }
 
     #[inline(always)]
@@ -113,8 +121,63 @@ impl BoxKernel for Avx512Boxes {
     }
 
     #[inline(always)]
-    fn sift(self, groups: &[RayGroup; GROUPS], sieve: &Sieve, mask: u64) -> u64 {
-        self.0.sift(groups, sieve, mask)
+    fn sift<const CERTAIN: bool>(
+        self,
+        groups: &[RayGroup; GROUPS],
+        sieve: &Sieve,
+        mask: u64,
+    ) -> [u64; 2] {
+        let [mut past, mut certain] = [0; 2];
+        // SAFETY: a value of this type says that the CPU has AVX-512. The loads, aligned as the
+        // groups are, read arrays of exactly 8 floats, of two groups.
+        unsafe {
+            let splat = |factors: &[f32; 4]| {
+                [_mm512_set1_ps(factors[0]), _mm512_set1_ps(factors[1]), _mm512_set1_ps(factors[2])]
+            };
+            let [first, second, last] =
+                [splat(&sieve.factors[0]), splat(&sieve.factors[1]), splat(&sieve.factors[2])];
+            let (below, above) = (_mm512_set1_ps(-sieve.bound), _mm512_set1_ps(sieve.bound));
+            let mut left = mask;
+            while left != 0 {
+                let start = left.trailing_zeros() as usize & (MOST_RAYS - 2 * LANES);
+                left &= !(0xFFFF << start);
+                let pair = &groups.as_chunks::<2>().0[start / (2 * LANES)];
+                let both = |axis: usize| {
+                    let load = |group: &RayGroup| {
+                        _mm256_castps_pd(_mm256_load_ps(group.rounded_slopes[axis].as_ptr()))
+                    };
+                    let low = _mm512_castpd256_pd512(load(&pair[0]));
+                    _mm512_castpd_ps(_mm512_insertf64x4::<1>(low, load(&pair[1])))
+                };
+                let (right, up) = (both(0), both(1));
+                let area = |edge: usize| {
+                    let nearly = _mm512_add_ps(last[edge], _mm512_mul_ps(right, first[edge]));
+                    _mm512_add_ps(nearly, _mm512_mul_ps(up, second[edge]))
+                };
+                let areas = [area(0), area(1), area(2)];
+                let least = _mm512_min_ps(areas[0], _mm512_min_ps(areas[1], areas[2]));
+                let most = _mm512_max_ps(areas[0], _mm512_max_ps(areas[1], areas[2]));
+                let is_below = _mm512_cmp_ps_mask::<_CMP_LT_OQ>(least, below);
+                let is_past = _mm512_mask_cmp_ps_mask::<_CMP_GT_OQ>(is_below, most, above);
+                past |= u64::from(is_past) << start;
+                if CERTAIN {
+                    let is_inside = _mm512_cmp_ps_mask::<_CMP_LT_OQ>(most, below)
+                        | _mm512_cmp_ps_mask::<_CMP_GT_OQ>(least, above);
+                    certain |= u64::from(is_inside) << start;
+                }
+            }
+        }
+        [mask & !past, mask & certain]
+    }
+
+    #[inline(always)]
+    fn find_ends(self, groups: &mut [RayGroup], focus: &Focus, axis: usize) -> Way {
+        self.0.find_ends(groups, focus, axis)
+    }
+
+    #[inline(always)]
+    fn pass_gate(self, groups: &[RayGroup; GROUPS], gate: &Gate, mask: u64) -> [u64; 2] {
+        self.0.pass_gate(groups, gate, mask)
     }
 
     #[inline(always)]

@@ -4,33 +4,37 @@ use std::arch::x86_64::{
     __m256, __m256d, _CMP_EQ_OQ, _CMP_GE_OQ, _CMP_GT_OQ, _CMP_LE_OQ, _CMP_LT_OQ, _MM_HINT_T0,
     _mm_add_ps, _mm_andnot_ps, _mm_cmple_ps, _mm_cvtss_f32, _mm_loadu_ps, _mm_max_ps, _mm_max_ss,
     _mm_min_ps, _mm_min_ss, _mm_movehdup_ps, _mm_movehl_ps, _mm_movemask_ps, _mm_mul_ps,
-    _mm_prefetch, _mm_set1_ps, _mm_setzero_ps, _mm_storeu_ps, _mm_sub_ps, _mm256_add_epi32,
-    _mm256_add_pd, _mm256_add_ps, _mm256_and_pd, _mm256_and_ps, _mm256_and_si256, _mm256_andnot_pd,
-    _mm256_blendv_pd, _mm256_castpd_ps, _mm256_castpd_si256, _mm256_castps_si256,
+    _mm_prefetch, _mm_set1_ps, _mm_setzero_ps, _mm_storeu_ps, _mm_sub_ps, _mm256_add_pd,
+    _mm256_add_ps, _mm256_and_pd, _mm256_and_ps, _mm256_andnot_pd, _mm256_andnot_ps,
+    _mm256_blendv_pd, _mm256_castpd_ps, _mm256_castpd_si256, _mm256_castps_pd, _mm256_castps_si256,
     _mm256_castps256_ps128, _mm256_castsi256_pd, _mm256_castsi256_ps, _mm256_cmp_pd, _mm256_cmp_ps,
-    _mm256_cvtpd_ps, _mm256_cvtps_pd, _mm256_div_pd, _mm256_extractf128_ps, _mm256_load_pd,
-    _mm256_load_ps, _mm256_loadu_pd, _mm256_loadu_ps, _mm256_max_pd, _mm256_max_ps, _mm256_min_pd,
-    _mm256_min_ps, _mm256_movemask_pd, _mm256_movemask_ps, _mm256_mul_pd, _mm256_mul_ps,
-    _mm256_or_pd, _mm256_or_si256, _mm256_permute2f128_pd, _mm256_permute4x64_epi64,
-    _mm256_permute4x64_pd, _mm256_set_m128, _mm256_set1_epi32, _mm256_set1_epi64x, _mm256_set1_pd,
-    _mm256_set1_ps, _mm256_setr_pd, _mm256_setzero_pd, _mm256_shuffle_ps, _mm256_srai_epi32,
-    _mm256_store_pd, _mm256_store_ps, _mm256_storeu_pd, _mm256_storeu_ps, _mm256_storeu_si256,
-    _mm256_sub_epi32, _mm256_sub_pd, _mm256_sub_ps, _mm256_unpackhi_pd, _mm256_unpacklo_pd,
+    _mm256_cmpeq_epi32, _mm256_cvtpd_ps, _mm256_cvtps_pd, _mm256_div_pd, _mm256_extractf128_ps,
+    _mm256_load_pd, _mm256_load_ps, _mm256_loadu_pd, _mm256_loadu_ps, _mm256_max_pd, _mm256_max_ps,
+    _mm256_min_pd, _mm256_min_ps, _mm256_movemask_pd, _mm256_movemask_ps, _mm256_mul_pd,
+    _mm256_mul_ps, _mm256_or_pd, _mm256_or_ps, _mm256_permute2f128_pd, _mm256_permute4x64_pd,
+    _mm256_set_m128, _mm256_set1_epi32, _mm256_set1_epi64x, _mm256_set1_pd, _mm256_set1_ps,
+    _mm256_setr_pd, _mm256_setzero_pd, _mm256_shuffle_ps, _mm256_store_pd, _mm256_store_ps,
+    _mm256_storeu_pd, _mm256_storeu_ps, _mm256_storeu_si256, _mm256_sub_pd, _mm256_sub_ps,
+    _mm256_unpackhi_pd, _mm256_unpacklo_pd, _mm256_xor_pd,
 };
 
 use super::{
-    box_ray::{BoxRay, FAR, NEAR, NEAR_FRAME},
+    box_ray::{BoxRay, FAR, LEAST_SLACK, NEAR, NEAR_FRAME, SLACK},
     boxes::{BoxKernel, KernelWork},
+    gate::{Gate, Way},
     lanes::{
-        Beam, CLASSES, Crossings, FACES, Focus, GROUPS, LANES, LEAST_COMPONENT, RayGroup, SIEVED,
-        Sieve, Turn, bounded,
+        Beam, CLASSES, Crossings, FACES, Focus, GROUPS, LANES, LEAST_COMPONENT, MOST_RAYS,
+        RayGroup, SIEVED, Sieve, Turn, bounded, class_of,
     },
     parallelepiped_x86,
     ray::{Ray, Shear},
 };
-use crate::prepared::{
-    node::{Frame, Node},
-    record::BoxPlanes,
+use crate::{
+    isa::Isa,
+    prepared::{
+        node::{Frame, Node},
+        record::BoxPlanes,
+    },
 };
 
 /// The kernel with SSE2, four boxes at a time. Every x86-64 CPU has it.
@@ -89,20 +93,20 @@ fn prefetch<T>(place: &T) {
 }
 
 /// The kernel with AVX2, all eight boxes at once. [`Avx2Boxes::detect`] makes it on CPUs that have
-/// AVX2, and nothing else does.
+/// all of [`Isa::Avx2`], and nothing else does.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Avx2Boxes(());
 
 impl Avx2Boxes {
     /// `None` on a CPU without AVX2.
     pub(super) fn detect() -> Option<Self> {
-        std::arch::is_x86_feature_detected!("avx2").then_some(Self(()))
+        Isa::Avx2.is_supported().then_some(Self(()))
     }
 }
 
 impl BoxKernel for Avx2Boxes {
     fn run<Input>(self, input: &Input, work: &mut impl KernelWork<Input>) {
-        #[target_feature(enable = "avx2")]
+        #[target_feature(enable = "avx2,bmi1,bmi2,lzcnt,popcnt")]
         fn run_compiled_for_avx2<Input>(
             kernel: Avx2Boxes,
             input: &Input,
@@ -110,7 +114,7 @@ impl BoxKernel for Avx2Boxes {
         ) {
             work.run(input, kernel);
         }
-        // SAFETY: a value of this type says that the CPU has AVX2.
+        // SAFETY: a value of this type says that the CPU has AVX2 and the others.
         unsafe { run_compiled_for_avx2(self, input, work) }
     }
 
@@ -202,59 +206,24 @@ impl BoxKernel for Avx2Boxes {
     }
 
     #[inline(always)]
+    fn common_class(self, rays: &[Ray], frame: &Frame) -> Option<u64> {
+        let first = rays.first()?;
+        let class = class_of(first, frame);
+        let is_common = match class / 8 {
+            0 => self.are_like::<0b00_00_00_00, 0b0110>(rays, frame),
+            1 => self.are_like::<0b01_01_01_01, 0b0101>(rays, frame),
+            2 => self.are_like::<0b10_10_10_10, 0b0011>(rays, frame),
+            _ => false,
+        };
+        is_common.then_some(class)
+    }
+
+    #[inline(always)]
     fn fill(self, group: &mut RayGroup, rays: [&Ray; LANES], turn: &Turn) {
-        let [a, b, c, d, e, f, g, h] = rays;
-        // SAFETY: a value of this type says that the CPU has AVX2. The stores write arrays of
-        // exactly 8 numbers, those of f64 by halves.
-        unsafe {
-            let halves = [self.numbers_of([a, b, c, d]), self.numbers_of([e, f, g, h])];
-            let one = _mm256_set1_pd(1.0);
-            let mut inverses = [[one; 3]; 2];
-            for axis in 0..3 {
-                let low = self.turned(halves[0][axis], axis, &turn.frame);
-                let high = self.turned(halves[1][axis], axis, &turn.frame);
-                let [below, above] = self.rounded_outward(low, high);
-                let forward = turn.is_forward[axis];
-                let (near, far) = if forward { (above, below) } else { (below, above) };
-                _mm256_store_ps(group.near_origin[axis].as_mut_ptr(), near);
-                _mm256_store_ps(group.far_origin[axis].as_mut_ptr(), far);
-                for half in 0..2 {
-                    inverses[half][axis] = _mm256_div_pd(one, halves[half][3 + axis]);
-                }
-                let [low, high] = inverses.map(|half| _mm256_cvtpd_ps(half[axis]));
-                let inverse = _mm256_set_m128(high, low);
-                _mm256_store_ps(group.inverse[axis].as_mut_ptr(), inverse);
-                let far_inverse = _mm256_mul_ps(inverse, _mm256_set1_ps(FAR));
-                _mm256_store_ps(group.far_inverse[axis].as_mut_ptr(), far_inverse);
-            }
-            let [x, y, z] = turn.axes;
-            let mut slopes = [[one; 2]; 2];
-            for (half, numbers) in halves.iter().enumerate() {
-                let store = |lanes: &mut [f64; LANES], numbers| {
-                    _mm256_store_pd(lanes.as_mut_ptr().add(4 * half), numbers);
-                };
-                for axis in 0..3 {
-                    store(&mut group.direction[axis], numbers[3 + axis]);
-                }
-                let leaving = group.leaving.as_mut_ptr().add(4 * half);
-                _mm256_store_pd(leaving.cast(), numbers[7]);
-                let depth = numbers[3 + z];
-                store(&mut group.origin[0], numbers[x]);
-                store(&mut group.origin[1], numbers[y]);
-                store(&mut group.origin[2], numbers[z]);
-                for (k, axis) in [x, y].into_iter().enumerate() {
-                    slopes[k][half] = _mm256_div_pd(numbers[3 + axis], depth);
-                    store(&mut group.slopes[k], slopes[k][half]);
-                }
-                store(&mut group.slopes[2], inverses[half][z]);
-                store(&mut group.reach, numbers[6]);
-            }
-            for (rounded, [low, high]) in group.rounded_slopes.iter_mut().zip(slopes) {
-                let both = _mm256_set_m128(_mm256_cvtpd_ps(high), _mm256_cvtpd_ps(low));
-                _mm256_store_ps(rounded.as_mut_ptr(), both);
-            }
-            let high = self.high(&halves.map(|numbers| numbers[6]), &turn.reach);
-            _mm256_store_ps(group.high.as_mut_ptr(), high);
+        match turn.axes[2] {
+            0 => self.fill_along::<0>(group, rays, turn),
+            1 => self.fill_along::<1>(group, rays, turn),
+            _ => self.fill_along::<2>(group, rays, turn),
         }
     }
 
@@ -322,9 +291,9 @@ impl BoxKernel for Avx2Boxes {
             let (near, far) = (splat(near), splat(far));
             let mut left = mask;
             while left != 0 {
-                let k = left.trailing_zeros() as usize / LANES % GROUPS;
-                let (group, asking) = (&groups[k], left >> (LANES * k) & 0xFF);
-                left &= !(0xFF << (LANES * k));
+                let first = left.trailing_zeros() as usize & (MOST_RAYS - LANES);
+                let group = &groups[first / LANES];
+                left &= !(0xFF << first);
                 let mut enter = _mm256_set1_ps(-0.0);
                 let mut leave = _mm256_load_ps(group.high.as_ptr());
                 for axis in 0..3 {
@@ -339,10 +308,10 @@ impl BoxKernel for Avx2Boxes {
                     leave = _mm256_min_ps(to_far, leave);
                 }
                 let is_met = _mm256_cmp_ps::<_CMP_LE_OQ>(enter, leave);
-                met |= (_mm256_movemask_ps(is_met) as u64 & asking) << (LANES * k);
+                met |= (_mm256_movemask_ps(is_met) as u64) << first;
             }
         }
-        met
+        met & mask
     }
 
     #[inline(always)]
@@ -500,8 +469,13 @@ impl BoxKernel for Avx2Boxes {
     }
 
     #[inline(always)]
-    fn sift(self, groups: &[RayGroup; GROUPS], sieve: &Sieve, mask: u64) -> u64 {
-        let mut possible = 0;
+    fn sift<const CERTAIN: bool>(
+        self,
+        groups: &[RayGroup; GROUPS],
+        sieve: &Sieve,
+        mask: u64,
+    ) -> [u64; 2] {
+        let [mut past, mut certain] = [0; 2];
         // SAFETY: a value of this type says that the CPU has AVX2. The loads, aligned as the groups
         // are, read arrays of exactly 8 floats.
         unsafe {
@@ -513,10 +487,9 @@ impl BoxKernel for Avx2Boxes {
             let (below, above) = (_mm256_set1_ps(-sieve.bound), _mm256_set1_ps(sieve.bound));
             let mut left = mask;
             while left != 0 {
-                let k = left.trailing_zeros() as usize / LANES % GROUPS;
-                let asking = left >> (LANES * k) & 0xFF;
-                left &= !(0xFF << (LANES * k));
-                let [right, up] = &groups[k].rounded_slopes;
+                let start = left.trailing_zeros() as usize & (MOST_RAYS - LANES);
+                left &= !(0xFF << start);
+                let [right, up] = &groups[start / LANES].rounded_slopes;
                 let right = _mm256_load_ps(right.as_ptr());
                 let up = _mm256_load_ps(up.as_ptr());
                 let area = |edge: usize| {
@@ -528,11 +501,95 @@ impl BoxKernel for Avx2Boxes {
                 let most = _mm256_max_ps(areas[0], _mm256_max_ps(areas[1], areas[2]));
                 let is_below = _mm256_cmp_ps::<_CMP_LT_OQ>(least, below);
                 let is_above = _mm256_cmp_ps::<_CMP_GT_OQ>(most, above);
-                let past = _mm256_movemask_ps(_mm256_and_ps(is_below, is_above)) as u64;
-                possible |= (asking & !past) << (LANES * k);
+                let is_past = _mm256_and_ps(is_below, is_above);
+                past |= (_mm256_movemask_ps(is_past) as u64) << start;
+                if CERTAIN {
+                    let is_inside = _mm256_or_ps(
+                        _mm256_cmp_ps::<_CMP_LT_OQ>(most, below),
+                        _mm256_cmp_ps::<_CMP_GT_OQ>(least, above),
+                    );
+                    certain |= (_mm256_movemask_ps(is_inside) as u64) << start;
+                }
             }
         }
-        possible
+        [mask & !past, mask & certain]
+    }
+
+    #[inline(always)]
+    fn find_ends(self, groups: &mut [RayGroup], focus: &Focus, axis: usize) -> Way {
+        let forward = 1.0_f64.copysign(groups[0].direction[axis][0]);
+        let mut longest = [0.0; 4];
+        // SAFETY: a value of this type says that the CPU has AVX2. The loads and stores, aligned
+        // as the groups are, take arrays of exactly 8 numbers, those of f64 by halves; the last
+        // store takes an array of exactly 4.
+        unsafe {
+            let sign = _mm256_set1_pd(-0.0);
+            let mut greatest = _mm256_setzero_pd();
+            for group in groups {
+                let [mut starts, mut goals] = [[greatest; 2]; 2];
+                for (half, (at_start, at_end)) in starts.iter_mut().zip(&mut goals).enumerate() {
+                    let load = |lanes: &[f64; LANES]| _mm256_load_pd(lanes.as_ptr().add(4 * half));
+                    let start =
+                        _mm256_sub_pd(load(&group.origin[2]), _mm256_set1_pd(focus.point[2]));
+                    let start = _mm256_mul_pd(_mm256_set1_pd(forward), start);
+                    let ahead = _mm256_andnot_pd(sign, load(&group.direction[axis]));
+                    let length = _mm256_mul_pd(load(&group.reach), ahead);
+                    let length = _mm256_min_pd(length, _mm256_set1_pd(2.0 * focus.most));
+                    let end = _mm256_add_pd(start, length);
+                    let (near, far) = (_mm256_andnot_pd(sign, start), _mm256_andnot_pd(sign, end));
+                    greatest = _mm256_max_pd(_mm256_max_pd(near, far), greatest);
+                    (*at_start, *at_end) = (start, end);
+                }
+                for (rounded, [low, high]) in group.ends.iter_mut().zip([starts, goals]) {
+                    _mm256_store_ps(rounded.as_mut_ptr(), self.single(low, high));
+                }
+            }
+            _mm256_storeu_pd(longest.as_mut_ptr(), greatest);
+        }
+        let [a, b, c, d] = longest;
+        Way { forward, longest: a.max(b).max(c.max(d)) }
+    }
+
+    #[inline(always)]
+    fn pass_gate(self, groups: &[RayGroup; GROUPS], gate: &Gate, mask: u64) -> [u64; 2] {
+        let [mut between, mut outside] = [0; 2];
+        // SAFETY: a value of this type says that the CPU has AVX2. The loads, aligned as the groups
+        // are, read arrays of exactly 8 numbers of 32 bits, any of which is a float.
+        unsafe {
+            let [x, y, z] = gate.normal;
+            let [x, y, z] = [_mm256_set1_ps(x), _mm256_set1_ps(y), _mm256_set1_ps(z)];
+            let height = _mm256_set1_ps(gate.height);
+            let (below, above) = (_mm256_set1_ps(-gate.bound), _mm256_set1_ps(gate.bound));
+            let surface = _mm256_set1_epi32(gate.surface.cast_signed());
+            let mut left = mask;
+            while left != 0 {
+                let first = left.trailing_zeros() as usize & (MOST_RAYS - LANES);
+                left &= !(0xFF << first);
+                let group = &groups[first / LANES];
+                let load = |lanes: &[f32; LANES]| _mm256_load_ps(lanes.as_ptr());
+                let [right, up] = [load(&group.rounded_slopes[0]), load(&group.rounded_slopes[1])];
+                let slope = _mm256_add_ps(z, _mm256_mul_ps(right, x));
+                let slope = _mm256_add_ps(slope, _mm256_mul_ps(up, y));
+                let start = _mm256_sub_ps(height, _mm256_mul_ps(load(&group.ends[0]), slope));
+                let end = _mm256_sub_ps(height, _mm256_mul_ps(load(&group.ends[1]), slope));
+                let (least, most) = (_mm256_min_ps(start, end), _mm256_max_ps(start, end));
+                let is_between = _mm256_and_ps(
+                    _mm256_cmp_ps::<_CMP_LT_OQ>(least, below),
+                    _mm256_cmp_ps::<_CMP_GT_OQ>(most, above),
+                );
+                let is_outside = _mm256_or_ps(
+                    _mm256_cmp_ps::<_CMP_GT_OQ>(least, above),
+                    _mm256_cmp_ps::<_CMP_LT_OQ>(most, below),
+                );
+                let surfaces = _mm256_load_ps(group.leaving.as_ptr().cast());
+                let leaves = _mm256_cmpeq_epi32(_mm256_castps_si256(surfaces), surface);
+                let is_outside = _mm256_or_ps(is_outside, _mm256_castsi256_ps(leaves));
+                let passed = _mm256_movemask_ps(_mm256_andnot_ps(is_outside, is_between)) as u64;
+                between |= passed << first;
+                outside |= (_mm256_movemask_ps(is_outside) as u64) << first;
+            }
+        }
+        [mask & between, mask & outside]
     }
 
     #[inline(always)]
@@ -649,6 +706,125 @@ impl Avx2Boxes {
         }
     }
 
+    /// Whether rays move along all axes, start near the frame, and have the signs and the largest
+    /// component in common, with nothing left in doubt: `LARGEST` has that component's number in
+    /// each pair of bits, `OTHERS` a bit for each of the others.
+    #[inline(always)]
+    fn are_like<const LARGEST: i32, const OTHERS: i32>(self, rays: &[Ray], frame: &Frame) -> bool {
+        // A cube in the ball that rays of packets start in.
+        let nearest = 0.57 * NEAR_FRAME / frame.scale;
+        let [x, y, z] = frame.origin;
+        // SAFETY: a value of this type says that the CPU has AVX2. A ray is 64 bytes without
+        // padding, of which numbers 0 to 3 and 3 to 6 are read.
+        unsafe {
+            let sign = _mm256_set1_pd(-0.0);
+            let middle = _mm256_setr_pd(x, y, z, 0.0);
+            let of = |ray: &Ray| std::ptr::from_ref(ray).cast::<f64>();
+            let first = _mm256_loadu_pd(of(&rays[0]).add(3));
+            for rays in rays.chunks(MOST_RAYS) {
+                let mut turned = _mm256_setzero_pd();
+                let mut least = _mm256_set1_pd(f64::INFINITY);
+                let mut is_along = _mm256_cmp_pd::<_CMP_EQ_OQ>(turned, turned);
+                let mut is_near = is_along;
+                for ray in rays {
+                    let start = _mm256_sub_pd(middle, _mm256_loadu_pd(of(ray)));
+                    let distance = _mm256_andnot_pd(sign, start);
+                    let near = _mm256_cmp_pd::<_CMP_LE_OQ>(distance, _mm256_set1_pd(nearest));
+                    is_near = _mm256_and_pd(is_near, near);
+                    let direction = _mm256_loadu_pd(of(ray).add(3));
+                    turned = _mm256_or_pd(turned, _mm256_xor_pd(direction, first));
+                    let size = _mm256_andnot_pd(sign, direction);
+                    least = _mm256_min_pd(size, least);
+                    let largest = _mm256_permute4x64_pd::<LARGEST>(size);
+                    let is_less = _mm256_cmp_pd::<_CMP_GT_OQ>(largest, size);
+                    is_along = _mm256_and_pd(is_along, is_less);
+                }
+                let least = _mm256_cmp_pd::<_CMP_GE_OQ>(least, _mm256_set1_pd(LEAST_COMPONENT));
+                let is_plain = _mm256_andnot_pd(turned, _mm256_and_pd(least, is_near));
+                if _mm256_movemask_pd(is_plain) & 0b0111 != 0b0111
+                    || _mm256_movemask_pd(is_along) & OTHERS != OTHERS
+                {
+                    return false;
+                }
+            }
+        }
+        true
+    }
+
+    /// `BoxKernel::fill` for rays with this depth axis.
+    #[inline(always)]
+    fn fill_along<const Z: usize>(self, group: &mut RayGroup, rays: [&Ray; LANES], turn: &Turn) {
+        let [a, b, c, d, e, f, g, h] = rays;
+        let (x, y) = ((Z + 1) % 3, (Z + 2) % 3);
+        // SAFETY: a value of this type says that the CPU has AVX2. The stores write arrays of
+        // exactly 8 numbers, those of f64 by halves.
+        unsafe {
+            let halves = [self.numbers_of([a, b, c, d]), self.numbers_of([e, f, g, h])];
+            let one = _mm256_set1_pd(1.0);
+            for axis in 0..3 {
+                let low = self.turned(halves[0][axis], axis, &turn.frame);
+                let high = self.turned(halves[1][axis], axis, &turn.frame);
+                let place = self.single(low, high);
+                let size = _mm256_andnot_ps(_mm256_set1_ps(-0.0), place);
+                let slack = _mm256_mul_ps(size, _mm256_set1_ps(SLACK));
+                let slack = _mm256_add_ps(slack, _mm256_set1_ps(LEAST_SLACK));
+                let way = if turn.is_forward[axis] { 1.0 } else { -1.0 };
+                let ahead = _mm256_mul_ps(slack, _mm256_set1_ps(way));
+                _mm256_store_ps(group.near_origin[axis].as_mut_ptr(), _mm256_add_ps(place, ahead));
+                _mm256_store_ps(group.far_origin[axis].as_mut_ptr(), _mm256_sub_ps(place, ahead));
+                let [low, high] = [
+                    _mm256_div_pd(one, halves[0][3 + axis]),
+                    _mm256_div_pd(one, halves[1][3 + axis]),
+                ];
+                if axis == Z {
+                    _mm256_store_pd(group.slopes[2].as_mut_ptr(), low);
+                    _mm256_store_pd(group.slopes[2].as_mut_ptr().add(4), high);
+                }
+                let inverse = self.single(low, high);
+                _mm256_store_ps(group.inverse[axis].as_mut_ptr(), inverse);
+                let far_inverse = _mm256_mul_ps(inverse, _mm256_set1_ps(FAR));
+                _mm256_store_ps(group.far_inverse[axis].as_mut_ptr(), far_inverse);
+            }
+            for (half, numbers) in halves.iter().enumerate() {
+                let store = |lanes: &mut [f64; LANES], numbers| {
+                    _mm256_store_pd(lanes.as_mut_ptr().add(4 * half), numbers);
+                };
+                for axis in 0..3 {
+                    store(&mut group.direction[axis], numbers[3 + axis]);
+                }
+                store(&mut group.origin[0], numbers[x]);
+                store(&mut group.origin[1], numbers[y]);
+                store(&mut group.origin[2], numbers[Z]);
+                store(&mut group.reach, numbers[6]);
+            }
+            for (k, axis) in [x, y].into_iter().enumerate() {
+                let [low, high] = [
+                    _mm256_div_pd(halves[0][3 + axis], halves[0][3 + Z]),
+                    _mm256_div_pd(halves[1][3 + axis], halves[1][3 + Z]),
+                ];
+                _mm256_store_pd(group.slopes[k].as_mut_ptr(), low);
+                _mm256_store_pd(group.slopes[k].as_mut_ptr().add(4), high);
+                _mm256_store_ps(group.rounded_slopes[k].as_mut_ptr(), self.single(low, high));
+            }
+            let [low, high] = [_mm256_castpd_ps(halves[0][7]), _mm256_castpd_ps(halves[1][7])];
+            let even = _mm256_castps_pd(_mm256_shuffle_ps::<0x88>(low, high));
+            let odd = _mm256_castps_pd(_mm256_shuffle_ps::<0xDD>(low, high));
+            let leaving = _mm256_permute4x64_pd::<0xD8>(even);
+            let after = _mm256_permute4x64_pd::<0xD8>(odd);
+            _mm256_store_pd(group.leaving.as_mut_ptr().cast(), leaving);
+            _mm256_store_pd(group.after.as_mut_ptr().cast(), after);
+            let high = self.high(&[halves[0][6], halves[1][6]], &turn.reach);
+            _mm256_store_ps(group.high.as_mut_ptr(), high);
+        }
+    }
+
+    /// Eight numbers in two halves, rounded.
+    #[inline(always)]
+    fn single(self, low: __m256d, high: __m256d) -> __m256 {
+        // SAFETY: a value of this type says that the CPU has AVX2.
+        unsafe { _mm256_set_m128(_mm256_cvtpd_ps(high), _mm256_cvtpd_ps(low)) }
+    }
+
     /// `BoxRay::reach` of a ray that ends at each of these distances, in two halves.
     #[inline(always)]
     fn high(self, reach: &[__m256d; 2], ray: &BoxRay) -> __m256 {
@@ -658,12 +834,11 @@ impl Avx2Boxes {
             for (high, &reach) in high.iter_mut().zip(reach) {
                 let from_start = _mm256_sub_pd(reach, _mm256_set1_pd(ray.start));
                 let scaled = _mm256_mul_pd(from_start, _mm256_set1_pd(ray.scale));
-                let plain = _mm256_add_pd(scaled, _mm256_set1_pd(ray.slack));
-                let size = _mm256_andnot_pd(_mm256_set1_pd(-0.0), plain);
-                *high = _mm256_add_pd(plain, _mm256_mul_pd(size, _mm256_set1_pd(NEAR)));
+                *high = _mm256_add_pd(scaled, _mm256_set1_pd(ray.slack));
             }
-            let [_, above] = self.rounded_outward(high[0], high[1]);
-            above
+            let plain = self.single(high[0], high[1]);
+            let size = _mm256_andnot_ps(_mm256_set1_ps(-0.0), plain);
+            _mm256_add_ps(plain, _mm256_mul_ps(size, _mm256_set1_ps(NEAR)))
         }
     }
 
@@ -708,36 +883,5 @@ impl Avx2Boxes {
     fn bits_of(self, value: u64) -> __m256d {
         // SAFETY: a value of this type says that the CPU has AVX2.
         unsafe { _mm256_castsi256_pd(_mm256_set1_epi64x(value.cast_signed())) }
-    }
-
-    /// Eight numbers in two halves as `below` and as `above` round them.
-    #[inline(always)]
-    fn rounded_outward(self, low: __m256d, high: __m256d) -> [__m256; 2] {
-        // SAFETY: a value of this type says that the CPU has AVX2.
-        unsafe {
-            let rounded = _mm256_set_m128(_mm256_cvtpd_ps(high), _mm256_cvtpd_ps(low));
-            let low_back = _mm256_cvtps_pd(_mm256_castps256_ps128(rounded));
-            let high_back = _mm256_cvtps_pd(_mm256_extractf128_ps::<1>(rounded));
-            // Answers of 64 bits to 32 bits each.
-            let narrow = |low, high| {
-                let pairs =
-                    _mm256_shuffle_ps::<0x88>(_mm256_castpd_ps(low), _mm256_castpd_ps(high));
-                _mm256_permute4x64_epi64::<0xD8>(_mm256_castps_si256(pairs))
-            };
-            let is_above = narrow(
-                _mm256_cmp_pd::<_CMP_GT_OQ>(low_back, low),
-                _mm256_cmp_pd::<_CMP_GT_OQ>(high_back, high),
-            );
-            let is_below = narrow(
-                _mm256_cmp_pd::<_CMP_LT_OQ>(low_back, low),
-                _mm256_cmp_pd::<_CMP_LT_OQ>(high_back, high),
-            );
-            let bits = _mm256_castps_si256(rounded);
-            // The step to the next number up: of a negative one the bits count down.
-            let step = _mm256_or_si256(_mm256_srai_epi32::<31>(bits), _mm256_set1_epi32(1));
-            let down = _mm256_sub_epi32(bits, _mm256_and_si256(is_above, step));
-            let up = _mm256_add_epi32(bits, _mm256_and_si256(is_below, step));
-            [_mm256_castsi256_ps(down), _mm256_castsi256_ps(up)]
-        }
     }
 }

@@ -196,7 +196,7 @@ mod tests {
             let mut packet = Packet::default();
             if !rays.is_empty() {
                 let members: Vec<u16> = (0..rays.len() as u16).collect();
-                packet.fill(ScalarBoxes, &frame, &rays, &members);
+                packet.fill(ScalarBoxes, &frame, &rays, (&members, true));
             }
             let [x, y, z] = packet.turn.axes;
             let corners = corners.map(|corner| [corner[x], corner[y], corner[z]]);
@@ -223,7 +223,7 @@ mod tests {
         distances: Vec<Option<u64>>,
         /// How far the lines pass by the packet's focus, the triangle's sieve and the rays that it
         /// lets through.
-        sifted: Option<(u64, Sieve, u64)>,
+        sifted: Option<(u64, Sieve, [u64; 2])>,
         shortened: String,
         classes: Vec<u64>,
         filled: Option<String>,
@@ -248,7 +248,7 @@ mod tests {
             let sifted = packet.focus.map(|focus| {
                 let spread = kernel.spread(&packet.groups[..count], &focus.point);
                 let sieve = kernel.sieve(corners, &focus);
-                (spread.to_bits(), sieve, kernel.sift(&packet.groups, &sieve, *mask))
+                (spread.to_bits(), sieve, kernel.sift::<true>(&packet.groups, &sieve, *mask))
             });
             let mut shortened = packet.groups[0];
             for (reach, t) in shortened.reach.iter_mut().zip(packet.groups[0].slopes[0]) {
@@ -326,7 +326,7 @@ mod tests {
                     assert_eq!(is(found.crossings.within), is_within, "{ray:?}");
                 }
                 assert!(is(found.crossings.possible) || t.is_none(), "{ray:?}");
-                if let Some((_, _, sifted)) = found.sifted {
+                if let Some((_, _, [sifted, _])) = found.sifted {
                     assert!(is(sifted) || t.is_none(), "{ray:?}");
                     held_back += u32::from(!is(sifted));
                 }

@@ -92,9 +92,9 @@ pub(super) fn cross_sphere_again(
 #[inline(always)]
 pub(super) fn leaves(group: &RayGroup, surface: u32, rank: u32) -> (u64, u64) {
     let (mut leaves, mut ahead) = (0, 0);
-    for (lane, &leaving) in group.leaving.iter().enumerate() {
-        leaves |= u64::from(leaving as u32 == surface) << lane;
-        ahead |= u64::from((leaving >> 32) < u64::from(rank)) << lane;
+    for (lane, (&leaving, &after)) in group.leaving.iter().zip(&group.after).enumerate() {
+        leaves |= u64::from(leaving == surface) << lane;
+        ahead |= u64::from(after < rank) << lane;
     }
     (leaves, leaves & ahead)
 }

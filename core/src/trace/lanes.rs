@@ -1,13 +1,10 @@
 //! Rays side by side, a lane each, and the tests that several of them take at once.
 
 use super::{
-    box_ray::{BoxRay, FAR, NEAR_FRAME},
+    box_ray::{BoxRay, FAR, LEAST_SLACK, NEAR_FRAME, SLACK},
     ray::{Projected, Ray, Shear, depth_axis, edge},
 };
-use crate::{
-    exact::float::{above, below},
-    prepared::node::{Frame, Node},
-};
+use crate::prepared::node::{Frame, Node};
 
 /// Rays of one class have the signs of their direction in common, and its largest component.
 /// Classes are numbered from 0 up to this, which is the class of a ray that can be in no packet.
@@ -40,8 +37,9 @@ pub(super) struct RayGroup {
     pub(super) rounded_slopes: [[f32; LANES]; 2],
     /// In the order x, y, z.
     pub(super) direction: [[f64; LANES]; 3],
-    /// The surface that a ray leaves in the lower half, what it went through in the upper half.
-    pub(super) leaving: [u64; LANES],
+    /// The surface that a ray leaves, and the rank of what it went through.
+    pub(super) leaving: [u32; LANES],
+    pub(super) after: [u32; LANES],
     /// Only what is met nearer than this counts.
     pub(super) reach: [f64; LANES],
     pub(super) near_origin: [[f32; LANES]; 3],
@@ -49,6 +47,9 @@ pub(super) struct RayGroup {
     pub(super) inverse: [[f32; LANES]; 3],
     pub(super) far_inverse: [[f32; LANES]; 3],
     pub(super) high: [f32; LANES],
+    /// Where a ray starts and where it ends, as depths behind the packet's [`Focus`] on the ray's
+    /// way: what gates compare. Only `BoxKernel::find_ends` fills it.
+    pub(super) ends: [[f32; LANES]; 2],
 }
 
 impl RayGroup {
@@ -58,12 +59,14 @@ impl RayGroup {
         rounded_slopes: [[0.0; LANES]; 2],
         direction: [[0.0; LANES]; 3],
         leaving: [0; LANES],
+        after: [0; LANES],
         reach: [0.0; LANES],
         near_origin: [[0.0; LANES]; 3],
         far_origin: [[0.0; LANES]; 3],
         inverse: [[0.0; LANES]; 3],
         far_inverse: [[0.0; LANES]; 3],
         high: [0.0; LANES],
+        ends: [[0.0; LANES]; 2],
     };
 }
 
@@ -119,6 +122,13 @@ impl Beam {
         high: 0.0,
     };
 
+    /// No ray starts farther from the frame's origin along an axis.
+    #[inline(always)]
+    pub(super) fn farthest_start(&self) -> f32 {
+        let sizes = self.near_origin.iter().chain(&self.far_origin).map(|place| place.abs());
+        sizes.fold(0.0, f32::max)
+    }
+
     /// Takes in what its rays have on an axis, on which they go forward or not.
     #[inline(always)]
     pub(super) fn set_axis(
@@ -144,19 +154,26 @@ pub(super) struct Focus {
     pub(super) point: [f64; 3],
     /// How far lines pass by it, at its depth, along the first or the second axis.
     pub(super) spread: f64,
+    /// Differences of coordinates, as seen from starts and from the point, are at most this.
+    pub(super) most: f64,
     /// What f64 rounding may take from twice an area.
     pub(super) blur: f64,
 }
 
 impl Focus {
-    /// A point for rays near the frame, with the axes of their [`Shear`]; `spread` is as
-    /// `BoxKernel::spread` finds it.
-    pub(super) fn new(point: [f64; 3], spread: f64, frame: &Frame, axes: [usize; 3]) -> Self {
-        let mut most = (NEAR_FRAME + 2.0) / frame.scale;
+    /// A point for rays that start within `farthest` of the frame's origin on each axis, in its
+    /// units, with the axes of their [`Shear`]; `spread` is as `BoxKernel::spread` finds it.
+    pub(super) fn new(
+        point: [f64; 3],
+        spread: f64,
+        (frame, farthest): (&Frame, f32),
+        axes: [usize; 3],
+    ) -> Self {
+        let mut most = (f64::from(farthest) + 2.0) / frame.scale;
         for (at, axis) in point.into_iter().zip(axes) {
             most += (at - frame.origin[axis]).abs();
         }
-        Self { point, spread, blur: most * most * BLUR }
+        Self { point, spread, most, blur: most * most * BLUR }
     }
 }
 
@@ -204,7 +221,7 @@ pub(super) fn larger(a: f32, b: f32) -> f32 {
 
 /// The rays of a mask for which `test` of their group says so.
 #[inline(always)]
-fn by_groups(mask: u64, mut test: impl FnMut(usize) -> u64) -> u64 {
+pub(super) fn by_groups(mask: u64, mut test: impl FnMut(usize) -> u64) -> u64 {
     let mut met = 0;
     for group in 0..GROUPS {
         let asking = mask >> (LANES * group) & 0xFF;
@@ -238,7 +255,9 @@ pub(super) fn fill(group: &mut RayGroup, rays: [&Ray; LANES], turn: &Turn) {
     for (lane, ray) in rays.into_iter().enumerate() {
         for axis in 0..3 {
             let relative = (ray.origin[axis] - turn.frame.origin[axis]) * turn.frame.scale;
-            let (low, high) = (below(relative), above(relative));
+            let place = relative as f32;
+            let slack = SLACK * place.abs() + LEAST_SLACK;
+            let (low, high) = (place - slack, place + slack);
             let (near, far) = if turn.is_forward[axis] { (high, low) } else { (low, high) };
             group.near_origin[axis][lane] = near;
             group.far_origin[axis][lane] = far;
@@ -248,7 +267,8 @@ pub(super) fn fill(group: &mut RayGroup, rays: [&Ray; LANES], turn: &Turn) {
             group.origin[axis][lane] = ray.origin[turn.axes[axis]];
             group.direction[axis][lane] = ray.direction[axis];
         }
-        group.leaving[lane] = u64::from(ray.after) << 32 | u64::from(ray.leaving.0);
+        group.leaving[lane] = ray.leaving.0;
+        group.after[lane] = ray.after;
         let [x, y, z] = turn.axes.map(|axis| ray.direction[axis]);
         group.slopes[0][lane] = x / z;
         group.slopes[1][lane] = y / z;
@@ -376,9 +396,14 @@ pub(super) fn bounded(of_edges: f64, focus: &Focus) -> f32 {
 
 /// `BoxKernel::sift` in plain Rust.
 #[inline(always)]
-pub(super) fn sift(groups: &[RayGroup; GROUPS], sieve: &Sieve, mask: u64) -> u64 {
+pub(super) fn sift<const CERTAIN: bool>(
+    groups: &[RayGroup; GROUPS],
+    sieve: &Sieve,
+    mask: u64,
+) -> [u64; 2] {
     let Sieve { factors: [first, second, last], bound } = sieve;
-    by_groups(mask, |k| {
+    let mut certain = 0;
+    let possible = by_groups(mask, |k| {
         let [right, up] = &groups[k].rounded_slopes;
         let mut possible = 0;
         for lane in 0..LANES {
@@ -388,9 +413,13 @@ pub(super) fn sift(groups: &[RayGroup; GROUPS], sieve: &Sieve, mask: u64) -> u64
             let is_past =
                 areas.iter().any(|area| *area < -bound) && areas.iter().any(|area| area > bound);
             possible |= u64::from(!is_past) << lane;
+            let is_certain =
+                areas.iter().all(|area| *area < -bound) || areas.iter().all(|area| area > bound);
+            certain |= u64::from(CERTAIN && is_certain) << (LANES * k + lane);
         }
         possible
-    })
+    });
+    [possible, certain & mask]
 }
 
 /// `BoxKernel::meet_beam` in plain Rust.

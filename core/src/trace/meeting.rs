@@ -29,6 +29,13 @@ pub(super) trait Meeting {
         distances: &[f64; LANES],
     ) -> u64;
 
+    /// The surface of a triangle that ends every ray which crosses it between its ends, unless it
+    /// leaves this surface. `None` where more is to be asked.
+    fn wall(&self, item: Item) -> Option<u32>;
+
+    /// The rays at these places, a bit each, certainly cross such a triangle.
+    fn stop(&mut self, stopped: u64);
+
     /// Whether each ray meets this sphere or quadrangle as [`Meeting::cross_sphere`] and
     /// [`Meeting::cross_quadrangle`] have it; else it is asked.
     fn is_plain(&self, item: Item) -> bool;

@@ -10,6 +10,7 @@ mod boxes_avx512;
 #[expect(unsafe_code, reason = "SIMD intrinsics")]
 mod boxes_x86;
 mod course;
+mod gate;
 mod hit;
 pub(crate) mod kernels;
 mod lane_faces;

@@ -12,6 +12,7 @@
 use super::{
     box_ray::BoxRay,
     boxes::BoxKernel,
+    gate::{Gate, Way},
     lane_faces::{cross_plane, cross_sphere, cross_sphere_again, leaves, pass_quadrangle},
     lanes::{Beam, Focus, GROUPS, LANES, MOST_RAYS, RayGroup, Turn, larger, shear_at},
     lone::step,
@@ -48,6 +49,8 @@ pub(super) struct Packet {
     has_one_start: bool,
     /// What sieves are made from, if rays have it.
     pub(super) focus: Option<Focus>,
+    /// What their ends are to it, if that is asked.
+    pub(super) way: Option<Way>,
     /// The groups with rays that reach less far than boxes know, a bit each.
     shortened: u64,
 }
@@ -79,31 +82,38 @@ impl Default for Packet {
             alive: 0,
             has_one_start: false,
             focus: None,
+            way: None,
             shortened: 0,
         }
     }
 }
 
 impl Packet {
-    /// Takes in the `members` of `rays`, which are of one class: at least one.
+    /// Takes in the `members` of `rays`, which are of one class: at least one. Whether something is
+    /// between their ends can be told at once only if that is said here.
     #[inline(always)]
     pub(super) fn fill(
         &mut self,
         kernel: impl BoxKernel,
         frame: &Frame,
         rays: &[Ray],
-        members: &[u16],
+        (members, has_walls): (&[u16], bool),
     ) {
         self.alive = u64::MAX >> (MOST_RAYS - members.len());
         self.turn = Turn::new(&rays[usize::from(members[0])], frame);
         let count = members.len().div_ceil(LANES);
-        for (group, members) in self.groups.iter_mut().zip(members.chunks(LANES)) {
+        let (full, rest) = members.as_chunks::<LANES>();
+        let mut padded = [0; LANES];
+        if let Some(last) = rest.last() {
             // Lanes without a ray have the last one.
-            let last = members.len() - 1;
-            let mut of_lanes = [&rays[usize::from(members[last])]; LANES];
-            for (of_lane, &member) in of_lanes.iter_mut().zip(members) {
-                *of_lane = &rays[usize::from(member)];
-            }
+            padded = [*last; LANES];
+            padded[..rest.len()].copy_from_slice(rest);
+        }
+        let rest = (!rest.is_empty()).then_some(&padded);
+        for (group, members) in self.groups.iter_mut().zip(full.iter().chain(rest)) {
+            let [a, b, c, d, e, f, g, h] = *members;
+            let ray = |member: u16| &rays[usize::from(member)];
+            let of_lanes = [ray(a), ray(b), ray(c), ray(d), ray(e), ray(f), ray(g), ray(h)];
             kernel.fill(group, of_lanes, &self.turn);
         }
         let groups = &self.groups[..count];
@@ -115,9 +125,14 @@ impl Packet {
         let place = [place[x], place[y], place[z]];
         let spread =
             if place[0].is_finite() { kernel.spread(groups, &place) } else { f64::INFINITY };
-        self.focus = (spread * frame.scale < MOST_SPREAD)
-            .then(|| Focus::new(place, spread, frame, self.turn.axes));
-        self.beam = kernel.surround(&self.groups[..count], self.turn.is_forward);
+        self.beam = kernel.surround(groups, self.turn.is_forward);
+        self.focus = (spread * frame.scale < MOST_SPREAD).then(|| {
+            Focus::new(place, spread, (frame, self.beam.farthest_start()), self.turn.axes)
+        });
+        self.way = match &self.focus {
+            Some(focus) if has_walls => Some(kernel.find_ends(&mut self.groups[..count], focus, z)),
+            _ => None,
+        };
     }
 
     /// Which rays of a mask meet the child of a node at this place.
@@ -233,7 +248,27 @@ impl Packet {
             if mask.count_ones() > FEW_TO_SIFT
                 && let Some(focus) = &self.focus
             {
-                mask = kernel.sift(&self.groups, &kernel.sieve(&corners, focus), mask);
+                let sieve = kernel.sieve(&corners, focus);
+                if let Some(way) = self.way {
+                    let [possible, certain] = kernel.sift::<true>(&self.groups, &sieve, mask);
+                    mask = possible;
+                    if mask != 0
+                        && let Some(wall) = meeting.wall(item)
+                    {
+                        let gate = Gate::new(&corners, wall, focus, way);
+                        let [between, outside] = kernel.pass_gate(&self.groups, &gate, mask);
+                        let stopped = certain & between;
+                        meeting.stop(stopped);
+                        is_changed |= stopped != 0;
+                        self.alive &= !stopped;
+                        mask &= !(outside | stopped);
+                    }
+                } else {
+                    [mask, _] = kernel.sift::<false>(&self.groups, &sieve, mask);
+                }
+                if mask == 0 {
+                    continue;
+                }
             }
             let met = kernel.cross(&self.groups, &corners, mask, &mut self.crossings);
             for (k, crossing) in groups(met.certain) {

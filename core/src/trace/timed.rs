@@ -46,10 +46,8 @@ impl<'a> TimedKernels<'a> {
             self.take(rays);
             let (view, hits) = (&self.view, &mut self.hits);
             let _ = trace(view, self.isa, &mut self.room, &self.rays, hits, &mut go_on);
-            for hit in hits {
-                let t = if hit.is_some() { hit.t } else { f64::INFINITY };
-                distances.push(t * from_units);
-            }
+            let told = |hit: &Hit| if hit.is_some() { hit.t } else { f64::INFINITY };
+            distances.extend(hits.iter().map(|hit| told(hit) * from_units));
         }
     }
 
@@ -60,9 +58,8 @@ impl<'a> TimedKernels<'a> {
             self.take(rays);
             let (aim, shares) = ((&[][..], &self.rays[..]), &mut self.shares);
             let _ = trace_shadows(&self.view, self.isa, &mut self.room, aim, shares, &mut go_on);
-            for &share in &self.shares {
-                distances.push(if share == 0.0 { 0.0 } else { f64::INFINITY });
-            }
+            let told = |&share| if share == 0.0 { 0.0 } else { f64::INFINITY };
+            distances.extend(self.shares.iter().map(told));
         }
     }
 
