@@ -11,6 +11,7 @@ use super::{
     },
     parallelepiped::PlaneCrossings,
     ray::{Ray, Shear},
+    solid_lanes::{self, MOST_LEAVES, Met, Seen, SolidRays},
 };
 use crate::prepared::{
     node::{Frame, Node},
@@ -141,6 +142,39 @@ pub(super) trait BoxKernel: Copy {
     #[inline(always)]
     fn face_at(self, (ray, left_at): (&Ray, f64), planes: &BoxPlanes, t: f64, enters: bool) -> u32 {
         PlaneCrossings::new(ray, left_at, planes).face(t, enters)
+    }
+
+    /// The boxes of a node that some ray `asking` touches, a bit each: those between its near and its
+    /// far planes.
+    #[inline(always)]
+    fn touch(self, rays: &SolidRays, node: &Node, sides: [[usize; 3]; 2], asking: u64) -> u32 {
+        solid_lanes::touch(rays, node, sides, asking)
+    }
+
+    /// Where rays enter and leave a parallelepiped; as [`BoxKernel::cross_box`] finds it for those
+    /// that are inside it and not in doubt. `any_leaves` where some ray leaves some surface.
+    #[inline(always)]
+    fn meet_box(
+        self,
+        rays: &SolidRays,
+        planes: &BoxPlanes,
+        (any_leaves, apart): (bool, f64),
+        ends: &mut [[f64; LANES]; 2],
+    ) -> Met {
+        solid_lanes::meet_box(rays, planes, (any_leaves, apart), ends)
+    }
+
+    /// Finds what rays are inside of just behind the places where they are `at`, and their `next`
+    /// ends.
+    #[inline(always)]
+    fn look(
+        self,
+        ends: &[[[f64; LANES]; 2]],
+        places: (&[f64; LANES], &[f64; LANES], f64),
+        inside: &mut [u8; MOST_LEAVES],
+        next: &mut [f64; LANES],
+    ) -> Seen {
+        solid_lanes::look(ends, places, inside, next)
     }
 
     /// Takes the numbers that are `t` out of four, so that they become infinite: a bit for each.

@@ -13,6 +13,7 @@ use super::{
     boxes_x86::Avx2Boxes,
     lanes::{Beam, Crossings, FACES, Focus, GROUPS, LANES, RayGroup, Sieve, Turn},
     ray::{Ray, Shear},
+    solid_lanes::{MOST_LEAVES, Met, Seen, SolidRays},
 };
 use crate::prepared::{
     node::{Frame, Node},
@@ -55,6 +56,33 @@ impl BoxKernel for Avx512Boxes {
     #[inline(always)]
     fn face_at(self, rays: (&Ray, f64), planes: &BoxPlanes, t: f64, enters: bool) -> u32 {
         self.0.face_at(rays, planes, t, enters)
+    }
+
+    #[inline(always)]
+    fn touch(self, rays: &SolidRays, node: &Node, sides: [[usize; 3]; 2], asking: u64) -> u32 {
+        self.0.touch(rays, node, sides, asking)
+    }
+
+    #[inline(always)]
+    fn meet_box(
+        self,
+        rays: &SolidRays,
+        planes: &BoxPlanes,
+        left: (bool, f64),
+        ends: &mut [[f64; LANES]; 2],
+    ) -> Met {
+        self.0.meet_box(rays, planes, left, ends)
+    }
+
+    #[inline(always)]
+    fn look(
+        self,
+        ends: &[[[f64; LANES]; 2]],
+        places: (&[f64; LANES], &[f64; LANES], f64),
+        inside: &mut [u8; MOST_LEAVES],
+        next: &mut [f64; LANES],
+    ) -> Seen {
+        self.0.look(ends, places, inside, next)
     }
 
     #[inline(always)]

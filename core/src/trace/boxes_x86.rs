@@ -27,6 +27,8 @@ use super::{
     },
     parallelepiped_x86,
     ray::{Ray, Shear},
+    solid_lanes::{MOST_LEAVES, Met, Seen, SolidRays},
+    solid_lanes_x86,
 };
 use crate::prepared::{
     node::{Frame, Node},
@@ -124,6 +126,42 @@ impl BoxKernel for Avx2Boxes {
     fn face_at(self, (ray, left_at): (&Ray, f64), planes: &BoxPlanes, t: f64, enters: bool) -> u32 {
         // SAFETY: a value of this type says that the CPU has AVX2.
         unsafe { parallelepiped_x86::face_at_with_avx2((ray, left_at), planes, t, enters) }
+    }
+
+    #[inline(always)]
+    fn touch(self, rays: &SolidRays, node: &Node, sides: [[usize; 3]; 2], asking: u64) -> u32 {
+        // SAFETY: a value of this type says that the CPU has AVX2.
+        unsafe { solid_lanes_x86::touch_with_avx2(rays, node, sides, asking) }
+    }
+
+    #[inline(always)]
+    fn meet_box(
+        self,
+        rays: &SolidRays,
+        planes: &BoxPlanes,
+        (any_leaves, apart): (bool, f64),
+        ends: &mut [[f64; LANES]; 2],
+    ) -> Met {
+        // SAFETY: a value of this type says that the CPU has AVX2.
+        unsafe {
+            if any_leaves {
+                solid_lanes_x86::meet_box_with_avx2::<true>(rays, planes, apart, ends)
+            } else {
+                solid_lanes_x86::meet_box_with_avx2::<false>(rays, planes, apart, ends)
+            }
+        }
+    }
+
+    #[inline(always)]
+    fn look(
+        self,
+        ends: &[[[f64; LANES]; 2]],
+        places: (&[f64; LANES], &[f64; LANES], f64),
+        inside: &mut [u8; MOST_LEAVES],
+        next: &mut [f64; LANES],
+    ) -> Seen {
+        // SAFETY: a value of this type says that the CPU has AVX2.
+        unsafe { solid_lanes_x86::look_with_avx2(ends, places, inside, next) }
     }
 
     #[inline(always)]

@@ -280,4 +280,4 @@ const NOWHERE: [f64; 2] = [f64::INFINITY, f64::NEG_INFINITY];
 
 /// The least cosine at which a leaf is met for sure: a crossing's doubt is then so small a part of
 /// the solid's margin that all together stay below half of it.
-const STEEP: f64 = 1.0 / (1 << 16) as f64;
+pub(super) const STEEP: f64 = 1.0 / (1 << 16) as f64;

@@ -31,6 +31,9 @@ const FEW: u32 = 2;
 /// So many rays, or fewer, are not sifted before they are tried on a triangle.
 const FEW_TO_SIFT: u32 = 8;
 
+/// Fewer rays of a group than this meet a solid each alone.
+const FEWEST_IN_SOLID: u32 = 2;
+
 /// Lines that pass by a point by no more than this part of the frame have it as a focus.
 const MOST_SPREAD: f64 = 1.0 / (1_u64 << 20) as f64;
 
@@ -213,12 +216,14 @@ impl Packet {
                     is_changed |= self.meet_quadrangle(view, (item, mask), meeting);
                     continue;
                 }
-                kind => {
+                Some(Kind::Solid) => {
+                    is_changed |= self.meet_solid((item, mask), meeting);
+                    continue;
+                }
+                _ => {
                     for place in places(mask) {
                         let shear = self.shear(place);
-                        let is_solid = kind == Some(Kind::Solid);
-                        let box_ray = if is_solid { self.box_ray(place) } else { BoxRay::NOWHERE };
-                        let step = meeting.ask(place, item, &shear, &box_ray);
+                        let step = meeting.ask(place, item, &shear, &BoxRay::NOWHERE);
                         is_changed |= self.take(place, &step);
                     }
                     continue;
@@ -339,6 +344,33 @@ impl Packet {
                 } else {
                     Step::Past
                 };
+                is_changed |= self.take(place, &step);
+            }
+        }
+        is_changed
+    }
+
+    /// The rays of a mask meet a solid; whether one has ended or reaches less far than before.
+    #[inline(always)]
+    fn meet_solid<M: Meeting>(&mut self, (item, mask): (Item, u64), meeting: &mut M) -> bool {
+        let mut is_changed = false;
+        for (k, asking) in groups(mask) {
+            let mut alone = asking;
+            if asking.count_ones() >= FEWEST_IN_SOLID {
+                let group = (&mut self.groups[k], LANES * k);
+                let [counts, in_doubt] = meeting.cross_solid(group, &self.turn, asking, item);
+                if counts != 0 && M::ENDS {
+                    self.alive &= !(counts << (LANES * k));
+                } else if counts != 0 {
+                    self.shortened |= 1 << k;
+                }
+                is_changed |= counts != 0;
+                alone = in_doubt;
+            }
+            for lane in lanes(alone) {
+                let place = LANES * k + lane;
+                let (shear, box_ray) = (self.shear(place), self.box_ray(place));
+                let step = meeting.ask(place, item, &shear, &box_ray);
                 is_changed |= self.take(place, &step);
             }
         }

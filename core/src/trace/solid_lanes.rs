@@ -1,0 +1,593 @@
+//! The rays of a group side by side through a solid, a lane each.
+//!
+//! Each leaf is met by all of them at once. Then every ray goes on to its next end at the same
+//! time, and what they are inside there is told for all by a bit each: an operation on leaves is
+//! one on such bits. Rays in doubt are left to `Scratch::cross`. docs/proof.md says why all others
+//! are told what the plain evaluation tells.
+
+use super::{
+    boxes::BoxKernel,
+    course::{Crossing, STEEP},
+    lane_faces::{cross_sphere, cross_sphere_again, leaves},
+    lanes::{LANES, RayGroup, Turn, larger, smaller},
+    packet::places,
+    ray::Ray,
+};
+use crate::prepared::{
+    face::Part,
+    layout::View,
+    node::Node,
+    record::{BoxPlanes, LeafRecord, SolidNodeKind, SolidNodeRecord, SolidRecord, Surface},
+};
+
+/// The most leaves that are met.
+pub(super) const MOST_LEAVES: usize = 32;
+
+/// Room for a number for each node, and for one that is above the root.
+const NODES: usize = 2 * SolidNodeRecord::BITS;
+
+/// A leaf that rays pass by is entered and left here.
+pub(super) const NOWHERE: [f64; 2] = [f64::INFINITY, f64::NEG_INFINITY];
+
+/// Rays on their courses, as a `Course` has one.
+#[derive(Debug, Clone, Copy)]
+#[repr(C, align(64))]
+pub(super) struct SolidRays {
+    /// They start where the courses do, in the order x, y, z, and reach as far from there; boxes
+    /// are those of the solid's frame. It has no slopes.
+    pub(super) near: RayGroup,
+    /// Boxes that they leave before this do not count.
+    pub(super) low: [f32; LANES],
+    /// The rays themselves start here on their courses.
+    pub(super) left_at: [f64; LANES],
+    /// The numbers of the surfaces that they leave, if any does.
+    pub(super) leaving: [f64; LANES],
+}
+
+/// Which rays are where, a bit each.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub(super) struct Met {
+    /// They are inside the leaf somewhere.
+    pub(super) met: u64,
+    /// Doubts might count there.
+    pub(super) in_doubt: u64,
+}
+
+/// A node whose rays count for the operation above it.
+#[derive(Debug, Clone, Copy, Default)]
+struct Operand {
+    node: u8,
+    parent: u8,
+    /// All bits where the parent, or the node itself, has the rays that are not inside.
+    turns_parent: u8,
+    turns: u8,
+}
+
+/// Room for the rays of a group in a solid.
+#[derive(Debug)]
+pub(super) struct SolidLanes {
+    rays: SolidRays,
+    /// The leaves that are met, in file order, and their nodes.
+    leaves: [(u8, u8); MOST_LEAVES],
+    /// Where rays enter and leave them.
+    ends: [[[f64; LANES]; 2]; MOST_LEAVES],
+    /// The rays that are inside each of them before a step and after it.
+    inside: [[u8; MOST_LEAVES]; 2],
+    /// The same for each node.
+    inside_nodes: [[u8; NODES]; 2],
+    /// The nodes that rays may be inside, from the leaves up.
+    operands: [Operand; SolidNodeRecord::BITS],
+    /// The operations among them and what each begins with.
+    operations: [(u8, u8); SolidNodeRecord::BITS],
+}
+
+impl Default for SolidLanes {
+    fn default() -> Self {
+        let zeros = [0.0; LANES];
+        Self {
+            rays: SolidRays {
+                near: RayGroup::EMPTY,
+                low: [0.0; LANES],
+                left_at: zeros,
+                leaving: zeros,
+            },
+            leaves: [(0, 0); MOST_LEAVES],
+            ends: [[zeros; 2]; MOST_LEAVES],
+            inside: [[0; MOST_LEAVES]; 2],
+            inside_nodes: [[0; NODES]; 2],
+            operands: [Operand::default(); SolidNodeRecord::BITS],
+            operations: [(0, 0); SolidNodeRecord::BITS],
+        }
+    }
+}
+
+/// The axes of the rays' starts.
+const AXES: [usize; 3] = [0, 1, 2];
+
+impl SolidRays {
+    /// Brings the rays of a group near a solid, as `Course::new` does with each.
+    #[inline(always)]
+    fn approach(&mut self, (group, turn): (&RayGroup, &Turn), solid: &SolidRecord) {
+        let Self { near, low, left_at, leaving } = self;
+        for (axis, starts) in turn.axes.into_iter().zip(&group.origin) {
+            near.origin[axis % 3] = *starts;
+        }
+        (near.direction, near.leaving) = (group.direction, group.leaving);
+        (near.inverse, near.far_inverse) = (group.inverse, group.far_inverse);
+        let middle = &solid.frame.origin;
+        let ([x, y, z], [dx, dy, dz]) = (&near.origin, &near.direction);
+        let mut starts = [0.0; LANES];
+        for lane in 0..LANES {
+            let ahead = (middle[0] - x[lane]) * dx[lane]
+                + (middle[1] - y[lane]) * dy[lane]
+                + (middle[2] - z[lane]) * dz[lane];
+            starts[lane] = if ahead.abs() * solid.frame.scale > 8.0 { ahead } else { 0.0 };
+        }
+        let scale = solid.frame.scale;
+        for (axis, middle) in middle.iter().enumerate() {
+            let (origins, directions) = (&mut near.origin[axis], &near.direction[axis]);
+            let forward = turn.is_forward[axis];
+            for lane in 0..LANES {
+                origins[lane] += starts[lane] * directions[lane];
+                let place = ((origins[lane] - middle) * scale) as f32;
+                let slack = 2.0 * f32::EPSILON * place.abs() + 1e-25;
+                let [high, low] = [place + slack, place - slack];
+                near.near_origin[axis][lane] = if forward { high } else { low };
+                near.far_origin[axis][lane] = if forward { low } else { high };
+            }
+        }
+        for lane in 0..LANES {
+            left_at[lane] = -starts[lane];
+            near.reach[lane] = group.reach[lane] - starts[lane];
+            let first = ((left_at[lane] - 2.0 * solid.margin) * scale) as f32;
+            low[lane] = first - (2.0 * f32::EPSILON * first.abs() + 1e-25);
+            let last = ((near.reach[lane] + 2.0 * solid.margin) * scale) as f32;
+            near.high[lane] = last + (2.0 * f32::EPSILON * last.abs() + 1e-25);
+            leaving[lane] = f64::from(group.leaving[lane] as u32);
+        }
+    }
+
+    /// Whether some ray leaves a surface.
+    #[inline(always)]
+    fn any_leaves(&self) -> bool {
+        let mut all = u32::MAX;
+        for leaving in self.near.leaving {
+            all &= leaving as u32;
+        }
+        all != Surface::NONE.0
+    }
+
+    /// A ray on its course, for which only its start, its direction and the surface that it leaves
+    /// count.
+    #[inline(always)]
+    fn ray(&self, lane: usize) -> Ray {
+        let RayGroup { origin: [x, y, z], direction: [dx, dy, dz], leaving, .. } = &self.near;
+        Ray {
+            origin: glam::DVec3::new(x[lane], y[lane], z[lane]),
+            direction: glam::DVec3::new(dx[lane], dy[lane], dz[lane]),
+            leaving: Surface(leaving[lane] as u32),
+            ..Ray::NOWHERE
+        }
+    }
+}
+
+impl SolidLanes {
+    /// Calls `take` with the lane for the crossings of the solid's surface by the rays `asking` of
+    /// a group, in order for each, until it says that this ray has enough; it is not told of
+    /// crossings at the start if that is so `wanted`. The solid has at most
+    /// [`SolidNodeRecord::BITS`] nodes. The rays that are in doubt, a bit each: what `take` was
+    /// told of them does not count.
+    #[inline(always)]
+    pub(super) fn cross(
+        &mut self,
+        (view, solid): (&View<'_>, &SolidRecord),
+        kernel: impl BoxKernel,
+        rays: (&RayGroup, &Turn),
+        (asking, skips_start): (u64, bool),
+        mut take: impl FnMut(usize, Crossing) -> bool,
+    ) -> u64 {
+        self.rays.approach(rays, solid);
+        let touched = self.touch((view, solid), kernel, asking, rays.1.is_forward);
+        if touched == 0 {
+            return 0;
+        }
+        if touched.count_ones() as usize > MOST_LEAVES {
+            return asking;
+        }
+        let apart = solid.margin / 1024.0;
+        let (count, mut in_doubt) = self.meet((view, solid), kernel, asking, (touched, apart));
+        let mut alive = asking & !in_doubt;
+        if count == 0 || alive == 0 {
+            return in_doubt;
+        }
+        let root = view.solid_nodes(solid).len() - 1;
+        let (operand_count, operation_count) = self.link(view.solid_nodes(solid), count);
+        let Self { rays, leaves, ends, inside, inside_nodes, operands, operations } = self;
+        let (leaves, ends) = (&leaves[..count], &ends[..count]);
+        let (operands, operations) = (&operands[..operand_count], &operations[..operation_count]);
+        // Before the first end that counts; none may be so near to the start that it is in one
+        // doubt with what lies behind.
+        let (mut first, mut bound) = (rays.left_at, rays.left_at);
+        for lane in 0..LANES {
+            if skips_start {
+                bound[lane] += apart;
+            } else {
+                first[lane] -= apart;
+            }
+        }
+        let (mut at, mut next) = ([0.0; LANES], [0.0; LANES]);
+        let reach = &rays.near.reach;
+        let [mut before, mut after] = [0, 1];
+        let seen = kernel.look(ends, (&first, reach, 0.0), &mut inside[before], &mut at);
+        alive &= seen.ahead;
+        combine(leaves, operands, operations, &inside[before], &mut inside_nodes[before]);
+        for lane in 0..LANES {
+            in_doubt |= u64::from(at[lane] < bound[lane]) << lane & alive;
+        }
+        alive &= !in_doubt;
+        while alive != 0 {
+            let seen = kernel.look(ends, (&at, reach, apart), &mut inside[after], &mut next);
+            in_doubt |= seen.near & alive;
+            alive &= !seen.near;
+            combine(leaves, operands, operations, &inside[after], &mut inside_nodes[after]);
+            let [was, is] = [&inside_nodes[before], &inside_nodes[after]];
+            let crossing = u64::from(was[root] ^ is[root]) & alive;
+            for lane in places(crossing) {
+                let lane = lane % LANES;
+                let bits = [&inside[before], &inside[after]];
+                let row = changed_row(bits, count, lane).unwrap_or_else(|| {
+                    let nodes = view.solid_nodes(solid);
+                    let node = changed_leaf(nodes, operands, [was, is], lane);
+                    leaves.iter().position(|&(_, of_row)| of_row == node).unwrap_or(0)
+                });
+                let number = u32::from(leaves[row].0);
+                let enters = inside[after][row] >> lane & 1 == 1;
+                let leaf = &view.solid_leaves(solid)[number as usize];
+                let face = if leaf.is_sphere() {
+                    0
+                } else {
+                    let planes = &view.box_planes[leaf.surface as usize];
+                    let ray = (&rays.ray(lane), rays.left_at[lane]);
+                    kernel.face_at(ray, planes, at[lane], enters)
+                };
+                let t = -rays.left_at[lane] + at[lane];
+                if take(lane, Crossing { t, part: Part::new(number, face) }) {
+                    alive &= !(1 << lane);
+                }
+            }
+            alive &= seen.ahead;
+            std::mem::swap(&mut at, &mut next);
+            std::mem::swap(&mut before, &mut after);
+        }
+        in_doubt
+    }
+
+    /// The leaves whose boxes some ray touches, a bit each.
+    #[inline(always)]
+    fn touch(
+        &self,
+        (view, solid): (&View<'_>, &SolidRecord),
+        kernel: impl BoxKernel,
+        asking: u64,
+        is_forward: [bool; 3],
+    ) -> u64 {
+        let bit = |index: usize| 1_u64.checked_shl(index as u32).unwrap_or(0);
+        let [mut near, mut far] = [[0; 3]; 2];
+        for axis in 0..3 {
+            let [low, high] = [axis, axis + 3];
+            [near[axis], far[axis]] = if is_forward[axis] { [low, high] } else { [high, low] };
+        }
+        let first = solid.first_box as usize;
+        let (mut touched, mut waiting) = (0, 1_u64);
+        while waiting != 0 {
+            let node = &view.solid_boxes[first + waiting.trailing_zeros() as usize];
+            waiting &= waiting - 1;
+            let mut met = kernel.touch(&self.rays, node, [near, far], asking);
+            while met != 0 {
+                let child = node.children[met.trailing_zeros() as usize & 7];
+                met &= met - 1;
+                if child.is_leaf() {
+                    touched |= bit(child.items().start);
+                } else {
+                    waiting |= bit(child.node() - first);
+                }
+            }
+        }
+        touched
+    }
+
+    /// The rays meet the leaves that are touched; how many count, and the rays in doubt.
+    #[inline(always)]
+    fn meet(
+        &mut self,
+        (view, solid): (&View<'_>, &SolidRecord),
+        kernel: impl BoxKernel,
+        asking: u64,
+        (mut touched, apart): (u64, f64),
+    ) -> (usize, u64) {
+        let any_leaves = self.rays.any_leaves();
+        let (mut count, mut in_doubt) = (0, 0);
+        while touched != 0 {
+            let number = touched.trailing_zeros();
+            touched &= touched - 1;
+            let leaf = &view.solid_leaves(solid)[number as usize];
+            let ends = &mut self.ends[count % MOST_LEAVES];
+            let met = if leaf.is_sphere() {
+                self.rays.meet_sphere(leaf, (any_leaves, apart), ends)
+            } else {
+                let planes = &view.box_planes[leaf.surface as usize];
+                kernel.meet_box(&self.rays, planes, (any_leaves, apart), ends)
+            };
+            in_doubt |= met.in_doubt & asking;
+            if met.met & asking == 0 {
+                // The leaves before the rest make no difference any more.
+                let rest = view.solid_nodes(solid)[leaf.node as usize].rest;
+                touched &= u64::MAX.checked_shl(rest).unwrap_or(0);
+                continue;
+            }
+            self.leaves[count % MOST_LEAVES] = (number as u8, leaf.node as u8);
+            count += 1;
+        }
+        (count, in_doubt)
+    }
+
+    /// Finds the nodes that rays may be inside, which are above the first `count` leaves; how many
+    /// of them are no root, and how many operations.
+    #[inline(always)]
+    fn link(&mut self, nodes: &[SolidNodeRecord], count: usize) -> (usize, usize) {
+        let mut active = 0_u64;
+        for &(_, leaf) in &self.leaves[..count] {
+            let mut node = u32::from(leaf);
+            while node < SolidNodeRecord::BITS as u32 && active >> node & 1 == 0 {
+                active |= 1 << node;
+                node = nodes[node as usize].parent;
+            }
+        }
+        let (mut operand_count, mut operation_count) = (0, 0);
+        let mut left = active;
+        // What an operation begins with: all rays are outside what is missing.
+        let mut begins = [0_u8; SolidNodeRecord::BITS];
+        while left != 0 {
+            let node = left.trailing_zeros() as usize;
+            left &= left - 1;
+            let record = &nodes[node];
+            let turns = if record.kind == SolidNodeKind::LEAF {
+                0
+            } else {
+                self.operations[operation_count] = (node as u8, begins[node]);
+                operation_count += 1;
+                if record.kind == SolidNodeKind::UNION { 0 } else { 0xFF }
+            };
+            let mut operand =
+                Operand { node: node as u8, parent: NODES as u8 - 1, turns_parent: 0, turns };
+            if let Some(parent) = nodes.get(record.parent as usize) {
+                let operands = record.siblings | 1 << node;
+                let (turns_parent, is_missing) = match parent.kind {
+                    SolidNodeKind::UNION => (0, false),
+                    SolidNodeKind::INTERSECTION => (0xFF, operands & !active != 0),
+                    _ if parent.first_child as usize == node => (0xFF, false),
+                    _ => (0, active >> parent.first_child & 1 == 0),
+                };
+                operand.parent = record.parent as u8;
+                operand.turns_parent = turns_parent;
+                if is_missing {
+                    begins[record.parent as usize % SolidNodeRecord::BITS] = 0xFF;
+                }
+            }
+            self.operands[operand_count % SolidNodeRecord::BITS] = operand;
+            operand_count += 1;
+        }
+        (operand_count, operation_count)
+    }
+}
+
+/// Finds which rays are inside each node from those that are inside the leaves.
+#[inline(always)]
+fn combine(
+    leaves: &[(u8, u8)],
+    operands: &[Operand],
+    operations: &[(u8, u8)],
+    inside: &[u8; MOST_LEAVES],
+    nodes: &mut [u8; NODES],
+) {
+    for &(node, begins) in operations {
+        nodes[usize::from(node) % NODES] = begins;
+    }
+    for (&(_, node), &inside) in leaves.iter().zip(inside) {
+        nodes[usize::from(node) % NODES] = inside;
+    }
+    for &Operand { node, parent, turns_parent, turns } in operands {
+        let inside = nodes[usize::from(node) % NODES] ^ turns;
+        nodes[usize::from(node) % NODES] = inside;
+        nodes[usize::from(parent) % NODES] |= inside ^ turns_parent;
+    }
+}
+
+/// The one leaf that a ray enters or leaves in a step; `None` if there are several.
+#[inline(always)]
+fn changed_row([was, is]: [&[u8; MOST_LEAVES]; 2], count: usize, lane: usize) -> Option<usize> {
+    let mut found = None;
+    for row in 0..count.min(MOST_LEAVES) {
+        if (was[row] ^ is[row]) >> lane & 1 == 1 {
+            if found.is_some() {
+                return None;
+            }
+            found = Some(row);
+        }
+    }
+    found
+}
+
+/// The node of the leaf whose face is there where a ray enters or leaves the root in a step with
+/// several leaves: at each operation the first operand that made it change.
+#[cold]
+fn changed_leaf(
+    nodes: &[SolidNodeRecord],
+    operands: &[Operand],
+    [was, is]: [&[u8; NODES]; 2],
+    lane: usize,
+) -> u8 {
+    let is_inside = |inside: &[u8; NODES], node: u8| inside[usize::from(node)] >> lane & 1 == 1;
+    let mut node = nodes.len() as u8 - 1;
+    loop {
+        let record = &nodes[usize::from(node)];
+        if record.kind == SolidNodeKind::LEAF {
+            return node;
+        }
+        let enters = is_inside(is, node);
+        let is_it = |operand: &&Operand| {
+            let is_taken = record.kind == SolidNodeKind::DIFFERENCE
+                && u32::from(operand.node) != record.first_child;
+            operand.parent == node
+                && is_inside(was, operand.node) != is_inside(is, operand.node)
+                && is_inside(is, operand.node) == (enters ^ is_taken)
+        };
+        let operand = operands.iter().find(is_it);
+        node = operand.expect("an operation changes only if an operand does").node;
+    }
+}
+
+impl SolidRays {
+    /// The rays meet a sphere, as `Course::sure_stretch` has it for one.
+    #[inline(always)]
+    fn meet_sphere(
+        &self,
+        leaf: &LeafRecord,
+        (any_leaves, apart): (bool, f64),
+        ends: &mut [[f64; LANES]; 2],
+    ) -> Met {
+        let sphere = cross_sphere(&self.near, AXES, &leaf.center, leaf.radius);
+        let (mut enters, mut exits) = (sphere.near, sphere.far);
+        let mut met = Met { met: sphere.met, in_doubt: 0 };
+        if any_leaves {
+            let (leaves, _) = leaves(&self.near, leaf.surface, 0);
+            if leaves != 0 {
+                let again = cross_sphere_again(&self.near, AXES, &leaf.center);
+                for lane in places(leaves) {
+                    let lane = lane % LANES;
+                    // What starts far off is left to who knows where that is.
+                    met.in_doubt |= u64::from(self.left_at[lane] != 0.0) << lane;
+                    [enters[lane], exits[lane]] = [again[lane].min(0.0), again[lane].max(0.0)];
+                }
+                met.met |= leaves;
+            }
+        }
+        if met.met == 0 {
+            return met;
+        }
+        let least = larger_f64(apart, STEEP * 2.0 * leaf.radius);
+        let [of_enters, of_exits] = ends;
+        for lane in 0..LANES {
+            let is_met = met.met >> lane & 1 == 1 && enters[lane] < exits[lane];
+            of_enters[lane] = if is_met { enters[lane] } else { NOWHERE[0] };
+            of_exits[lane] = if is_met { exits[lane] } else { NOWHERE[1] };
+            met.in_doubt |= u64::from(is_met && exits[lane] - enters[lane] <= least) << lane;
+        }
+        met
+    }
+}
+
+fn larger_f64(a: f64, b: f64) -> f64 {
+    if a > b { a } else { b }
+}
+
+/// What the rays are to what comes next.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub(super) struct Seen {
+    /// Their next end is within reach.
+    pub(super) ahead: u64,
+    /// It may be in one doubt with where they are.
+    pub(super) near: u64,
+}
+
+/// `BoxKernel::touch` in plain Rust.
+#[inline(always)]
+pub(super) fn touch(
+    rays: &SolidRays,
+    node: &Node,
+    [near, far]: [[usize; 3]; 2],
+    asking: u64,
+) -> u32 {
+    let group = &rays.near;
+    let mut touched = 0;
+    for (child, _) in node.children.iter().enumerate() {
+        let mut met = 0;
+        for lane in 0..LANES {
+            let (mut enter, mut leave) = (rays.low[lane], group.high[lane]);
+            for axis in 0..3 {
+                let to_near = node.planes[near[axis]][child] - group.near_origin[axis][lane];
+                let to_far = node.planes[far[axis]][child] - group.far_origin[axis][lane];
+                enter = larger(to_near * group.inverse[axis][lane], enter);
+                leave = smaller(to_far * group.far_inverse[axis][lane], leave);
+            }
+            met |= u64::from(enter <= leave) << lane;
+        }
+        touched |= u32::from(met & asking != 0) << child;
+    }
+    touched
+}
+
+/// `BoxKernel::meet_box` in plain Rust.
+#[inline(always)]
+pub(super) fn meet_box(
+    rays: &SolidRays,
+    planes: &BoxPlanes,
+    (any_leaves, apart): (bool, f64),
+    [enters, exits]: &mut [[f64; LANES]; 2],
+) -> Met {
+    let ([x, y, z], [dx, dy, dz]) = (&rays.near.origin, &rays.near.direction);
+    let ([px, py, pz], [nx, ny, nz]) = (&planes.points, &planes.normals);
+    let mut met = Met::default();
+    for lane in 0..LANES {
+        let (mut enter, mut leave, mut least) = (f64::NEG_INFINITY, f64::INFINITY, f64::INFINITY);
+        for face in 0..6 {
+            let to = [px[face] - x[lane], py[face] - y[lane], pz[face] - z[lane]];
+            let distance = nx[face] * to[0] + ny[face] * to[1] + nz[face] * to[2];
+            let along = nx[face] * dx[lane] + ny[face] * dy[lane] + nz[face] * dz[lane];
+            let is_left = any_leaves && planes.surfaces[face] == rays.leaving[lane];
+            let t = if is_left { rays.left_at[lane] } else { distance / along };
+            if along.is_sign_negative() {
+                enter = if t > enter { t } else { enter };
+            } else {
+                leave = if t < leave { t } else { leave };
+            }
+            let cosine = along.abs();
+            least = if cosine < least { cosine } else { least };
+        }
+        let is_met = enter < leave;
+        let is_sure = least >= STEEP && leave - enter > apart;
+        met.met |= u64::from(is_met) << lane;
+        met.in_doubt |= u64::from((is_met && !is_sure) || least == 0.0) << lane;
+        [enters[lane], exits[lane]] = if is_met { [enter, leave] } else { NOWHERE };
+    }
+    met
+}
+
+/// `BoxKernel::look` in plain Rust.
+#[inline(always)]
+pub(super) fn look(
+    ends: &[[[f64; LANES]; 2]],
+    (at, reach, apart): (&[f64; LANES], &[f64; LANES], f64),
+    inside: &mut [u8; MOST_LEAVES],
+    next: &mut [f64; LANES],
+) -> Seen {
+    *next = [f64::INFINITY; LANES];
+    for ([enters, exits], inside) in ends.iter().zip(inside) {
+        *inside = 0;
+        for lane in 0..LANES {
+            let is_before = enters[lane] > at[lane];
+            let is_behind = exits[lane] <= at[lane];
+            let end = if is_behind { f64::INFINITY } else { exits[lane] };
+            let end = if is_before { enters[lane] } else { end };
+            next[lane] = if end < next[lane] { end } else { next[lane] };
+            *inside |= u8::from(!is_before && !is_behind) << lane;
+        }
+    }
+    let mut seen = Seen::default();
+    for lane in 0..LANES {
+        let is_ahead = next[lane] <= reach[lane] && next[lane] < f64::INFINITY;
+        seen.ahead |= u64::from(is_ahead) << lane;
+        seen.near |= u64::from(next[lane] - at[lane] <= apart) << lane;
+    }
+    seen
+}
