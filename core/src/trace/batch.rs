@@ -14,7 +14,7 @@ use super::{
         take_quadrangle, take_sphere,
     },
     kernels::run_with_kernel,
-    lanes::{CLASSES, LANES, MOST_RAYS, RayGroup, Turn},
+    lanes::{CLASSES, GROUPS, LANES, MOST_RAYS, RayGroup, Turn},
     lone::{Flights, visit_alone},
     meeting::Meeting,
     packet::{Packet, PacketStack, places, visit_packet},
@@ -284,7 +284,7 @@ impl<K: BoxKernel> Meeting for NearestOfPacket<'_, K> {
     #[inline(always)]
     fn cross_solid(
         &mut self,
-        (group, first): (&mut RayGroup, usize),
+        groups: &mut [RayGroup; GROUPS],
         turn: &Turn,
         asking: u64,
         item: Item,
@@ -292,21 +292,23 @@ impl<K: BoxKernel> Meeting for NearestOfPacket<'_, K> {
         let Self { view, kernel, rays, members, hits, scratch } = self;
         let solid = &view.solids[item.index()];
         let mut met = 0;
-        let take = |lane: usize, crossing: Crossing| {
-            let member = usize::from(members[first + lane]);
+        let take = |place: usize, crossing: Crossing| {
+            let member = usize::from(members[place]);
             let is_met = counts(view, solid, &rays[member], crossing);
             let Crossing { t, part } = crossing;
             if is_met && take(&mut hits[member], item, (t, part.rank(solid), part)) {
-                met |= 1 << lane;
+                met |= 1 << place;
             }
             is_met
         };
+        let nothing_ahead = u64::from(Ray::NOTHING_AHEAD);
         let skips_start = places(asking)
-            .all(|lane| group.leaving[lane % LANES] >> 32 == u64::from(Ray::NOTHING_AHEAD));
-        let (rays, asking) = ((&*group, turn), (asking, skips_start));
+            .all(|place| groups[place / LANES].leaving[place % LANES] >> 32 == nothing_ahead);
+        let (rays, asking) = ((&*groups, turn), (asking, skips_start));
         let in_doubt = cross_solid_together(*kernel, (view, item), rays, asking, scratch, take);
-        for lane in places(met) {
-            group.reach[lane % LANES] = hits[usize::from(members[first + lane])].t;
+        for place in places(met) {
+            let reach = hits[usize::from(members[place])].t;
+            groups[place / LANES].reach[place % LANES] = reach;
         }
         [met, in_doubt]
     }
@@ -473,7 +475,7 @@ impl<K: BoxKernel> Meeting for BlockedOfPacket<'_, K> {
     #[inline(always)]
     fn cross_solid(
         &mut self,
-        (group, first): (&mut RayGroup, usize),
+        groups: &mut [RayGroup; GROUPS],
         turn: &Turn,
         asking: u64,
         item: Item,
@@ -485,22 +487,22 @@ impl<K: BoxKernel> Meeting for BlockedOfPacket<'_, K> {
         let solid = &view.solids[item.index()];
         let told = shades.clear.len();
         let mut met = 0;
-        let take = |lane: usize, Crossing { t, part }: Crossing| {
-            let member = members[first + lane];
+        let take = |place: usize, Crossing { t, part }: Crossing| {
+            let member = members[place];
             let is_between = t > 0.0 && t < rays[usize::from(member)].reach;
             let is_blocked =
                 is_between && shades.block(view, member, part.rank(solid), Face { item, part });
-            met |= u64::from(is_blocked) << lane;
+            met |= u64::from(is_blocked) << place;
             is_blocked
         };
-        let (rays, asking) = ((&*group, turn), (asking, true));
+        let (rays, asking) = ((&*groups, turn), (asking, true));
         let in_doubt = cross_solid_together(*kernel, (view, item), rays, asking, scratch, take);
         if in_doubt != 0 {
             // What these were told of does not count.
-            let mut place = 0;
+            let mut at = 0;
             shades.clear.retain(|&(member, ..)| {
-                place += 1;
-                place <= told || !places(in_doubt).any(|lane| members[first + lane] == member)
+                at += 1;
+                at <= told || !places(in_doubt).any(|place| members[place] == member)
             });
         }
         [met, in_doubt]

@@ -11,11 +11,11 @@ use super::{
     },
     parallelepiped::PlaneCrossings,
     ray::{Ray, Shear},
-    solid_lanes::{self, MOST_LEAVES, Met, Seen, SolidRays},
+    solid_lanes::{self, MOST_LEAVES, Met, Seen, SolidBeam, SolidRays},
 };
 use crate::prepared::{
     node::{Frame, Node},
-    record::BoxPlanes,
+    record::{BoxPlanes, LeafRecord, SolidRecord},
 };
 
 /// Tests a ray against a node's eight boxes: the distances at which it enters them, and which of
@@ -144,11 +144,48 @@ pub(super) trait BoxKernel: Copy {
         PlaneCrossings::new(ray, left_at, planes).face(t, enters)
     }
 
-    /// The boxes of a node that some ray `asking` touches, a bit each: those between its near and its
-    /// far planes.
+    /// Brings the rays of a group near a solid, as `Course::new` does with each; whether some ray
+    /// leaves a surface.
     #[inline(always)]
-    fn touch(self, rays: &SolidRays, node: &Node, sides: [[usize; 3]; 2], asking: u64) -> u32 {
-        solid_lanes::touch(rays, node, sides, asking)
+    fn approach(
+        self,
+        rays: &mut SolidRays,
+        group: (&RayGroup, &Turn),
+        solid: &SolidRecord,
+    ) -> bool {
+        solid_lanes::approach(rays, group, solid)
+    }
+
+    /// The beam of rays near a solid, which go forward on these axes.
+    #[inline(always)]
+    fn surround_near(self, rays: &[SolidRays], is_forward: [bool; 3]) -> SolidBeam {
+        solid_lanes::surround_near(rays, is_forward)
+    }
+
+    /// The boxes of a node that some ray may touch, a bit each.
+    #[inline(always)]
+    fn touch_beam(self, node: &Node, beam: &SolidBeam) -> u32 {
+        solid_lanes::touch_beam(node, beam)
+    }
+
+    /// The groups `asking` of which some ray that asks touches the box between three near and three
+    /// far planes, a bit each.
+    #[inline(always)]
+    fn touch(self, rays: &[SolidRays], asking: (&[(usize, u8)], u8), planes: [[f32; 3]; 2]) -> u8 {
+        solid_lanes::touch(rays, asking, planes)
+    }
+
+    /// Where rays enter and leave a sphere, as `Course::sure_stretch` finds it for those that are
+    /// inside it and not in doubt. `any_leaves` where some ray leaves some surface.
+    #[inline(always)]
+    fn meet_ball(
+        self,
+        rays: &SolidRays,
+        leaf: &LeafRecord,
+        (any_leaves, apart): (bool, f64),
+        ends: &mut [[f64; LANES]; 2],
+    ) -> Met {
+        solid_lanes::meet_ball(rays, leaf, (any_leaves, apart), ends)
     }
 
     /// Where rays enter and leave a parallelepiped; as [`BoxKernel::cross_box`] finds it for those

@@ -13,11 +13,11 @@ use super::{
     boxes_x86::Avx2Boxes,
     lanes::{Beam, Crossings, FACES, Focus, GROUPS, LANES, RayGroup, Sieve, Turn},
     ray::{Ray, Shear},
-    solid_lanes::{MOST_LEAVES, Met, Seen, SolidRays},
+    solid_lanes::{MOST_LEAVES, Met, Seen, SolidBeam, SolidRays},
 };
 use crate::prepared::{
     node::{Frame, Node},
-    record::BoxPlanes,
+    record::{BoxPlanes, LeafRecord, SolidRecord},
 };
 
 /// The kernel with AVX-512 (F and VL). [`Avx512Boxes::detect`] makes it on CPUs that have these,
@@ -59,8 +59,39 @@ impl BoxKernel for Avx512Boxes {
     }
 
     #[inline(always)]
-    fn touch(self, rays: &SolidRays, node: &Node, sides: [[usize; 3]; 2], asking: u64) -> u32 {
-        self.0.touch(rays, node, sides, asking)
+    fn approach(
+        self,
+        rays: &mut SolidRays,
+        group: (&RayGroup, &Turn),
+        solid: &SolidRecord,
+    ) -> bool {
+        self.0.approach(rays, group, solid)
+    }
+
+    #[inline(always)]
+    fn surround_near(self, rays: &[SolidRays], is_forward: [bool; 3]) -> SolidBeam {
+        self.0.surround_near(rays, is_forward)
+    }
+
+    #[inline(always)]
+    fn touch_beam(self, node: &Node, beam: &SolidBeam) -> u32 {
+        self.0.touch_beam(node, beam)
+    }
+
+    #[inline(always)]
+    fn touch(self, rays: &[SolidRays], asking: (&[(usize, u8)], u8), planes: [[f32; 3]; 2]) -> u8 {
+        self.0.touch(rays, asking, planes)
+    }
+
+    #[inline(always)]
+    fn meet_ball(
+        self,
+        rays: &SolidRays,
+        leaf: &LeafRecord,
+        (any_leaves, apart): (bool, f64),
+        ends: &mut [[f64; LANES]; 2],
+    ) -> Met {
+        self.0.meet_ball(rays, leaf, (any_leaves, apart), ends)
     }
 
     #[inline(always)]

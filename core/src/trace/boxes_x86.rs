@@ -27,12 +27,12 @@ use super::{
     },
     parallelepiped_x86,
     ray::{Ray, Shear},
-    solid_lanes::{MOST_LEAVES, Met, Seen, SolidRays},
+    solid_lanes::{MOST_LEAVES, Met, Seen, SolidBeam, SolidRays},
     solid_lanes_x86,
 };
 use crate::prepared::{
     node::{Frame, Node},
-    record::BoxPlanes,
+    record::{BoxPlanes, LeafRecord, SolidRecord},
 };
 
 /// The kernel with SSE2, four boxes at a time. Every x86-64 CPU has it.
@@ -129,9 +129,50 @@ impl BoxKernel for Avx2Boxes {
     }
 
     #[inline(always)]
-    fn touch(self, rays: &SolidRays, node: &Node, sides: [[usize; 3]; 2], asking: u64) -> u32 {
+    fn approach(
+        self,
+        rays: &mut SolidRays,
+        group: (&RayGroup, &Turn),
+        solid: &SolidRecord,
+    ) -> bool {
         // SAFETY: a value of this type says that the CPU has AVX2.
-        unsafe { solid_lanes_x86::touch_with_avx2(rays, node, sides, asking) }
+        unsafe { solid_lanes_x86::approach_with_avx2(rays, group, solid) }
+    }
+
+    #[inline(always)]
+    fn surround_near(self, rays: &[SolidRays], is_forward: [bool; 3]) -> SolidBeam {
+        // SAFETY: a value of this type says that the CPU has AVX2.
+        unsafe { solid_lanes_x86::surround_near_with_avx2(rays, is_forward) }
+    }
+
+    #[inline(always)]
+    fn touch_beam(self, node: &Node, beam: &SolidBeam) -> u32 {
+        // SAFETY: a value of this type says that the CPU has AVX2.
+        unsafe { solid_lanes_x86::touch_beam_with_avx2(node, beam) }
+    }
+
+    #[inline(always)]
+    fn touch(self, rays: &[SolidRays], asking: (&[(usize, u8)], u8), planes: [[f32; 3]; 2]) -> u8 {
+        // SAFETY: a value of this type says that the CPU has AVX2.
+        unsafe { solid_lanes_x86::touch_with_avx2(rays, asking, planes) }
+    }
+
+    #[inline(always)]
+    fn meet_ball(
+        self,
+        rays: &SolidRays,
+        leaf: &LeafRecord,
+        (any_leaves, apart): (bool, f64),
+        ends: &mut [[f64; LANES]; 2],
+    ) -> Met {
+        // SAFETY: a value of this type says that the CPU has AVX2.
+        unsafe {
+            if any_leaves {
+                solid_lanes_x86::meet_ball_with_avx2::<true>(rays, leaf, apart, ends)
+            } else {
+                solid_lanes_x86::meet_ball_with_avx2::<false>(rays, leaf, apart, ends)
+            }
+        }
     }
 
     #[inline(always)]

@@ -6,7 +6,7 @@ use super::{
     box_ray::BoxRay,
     boxes::{BoxKernel, KernelWork},
     course::Crossing,
-    lanes::{RayGroup, Turn},
+    lanes::{GROUPS, RayGroup, Turn},
     quadrangle::{hit_chord, hit_plane, is_inside},
     ray::{Hit, Ray, Shear},
     solid::Scratch,
@@ -212,10 +212,10 @@ fn cross_solid<F: FnMut(Crossing) -> bool>(
     kernel.run(view, &mut work);
 }
 
-/// Rays of a group in a solid, the crossings of which `take` is told of.
+/// Rays of a packet in a solid, the crossings of which `take` is told of.
 struct CrossSolidTogether<'a, F> {
     solid: &'a SolidRecord,
-    rays: (&'a RayGroup, &'a Turn),
+    rays: (&'a [RayGroup; GROUPS], &'a Turn),
     asking: (u64, bool),
     scratch: &'a mut Scratch,
     take: F,
@@ -230,13 +230,13 @@ impl<F: FnMut(usize, Crossing) -> bool> KernelWork<View<'_>> for CrossSolidToget
     }
 }
 
-/// Crosses a solid with the rays `asking` of a group, where none ends on a light, as
+/// Crosses a solid with the rays `asking` of a packet, where none ends on a light, as
 /// `SolidLanes::cross` has it; the rays in doubt.
 #[inline(never)]
 pub(super) fn cross_solid_together<F: FnMut(usize, Crossing) -> bool>(
     kernel: impl BoxKernel,
     (view, item): (&View<'_>, Item),
-    rays: (&RayGroup, &Turn),
+    rays: (&[RayGroup; GROUPS], &Turn),
     asking: (u64, bool),
     scratch: &mut Scratch,
     take: F,

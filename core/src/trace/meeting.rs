@@ -2,7 +2,7 @@
 
 use super::{
     box_ray::BoxRay,
-    lanes::{LANES, RayGroup, Turn},
+    lanes::{GROUPS, LANES, RayGroup, Turn},
     ray::Shear,
     traversal::Step,
 };
@@ -40,12 +40,12 @@ pub(super) trait Meeting {
     /// The ray's line crosses a quadrangle that the ray does not leave, at a distance above 0.
     fn cross_quadrangle(&mut self, place: usize, item: Item, t: f64) -> Step;
 
-    /// The rays `asking` of a group whose first one is at a place may meet a solid: which of them
-    /// have met something that counts, and which are in doubt and ask alone. Where rays reach less
-    /// far then, the group knows.
+    /// The rays `asking` of a packet may meet a solid: which of them have met something that
+    /// counts, and which are in doubt and ask alone. Where rays reach less far then, their groups
+    /// know.
     fn cross_solid(
         &mut self,
-        group: (&mut RayGroup, usize),
+        groups: &mut [RayGroup; GROUPS],
         turn: &Turn,
         asking: u64,
         item: Item,

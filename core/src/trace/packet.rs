@@ -353,26 +353,28 @@ impl Packet {
     /// The rays of a mask meet a solid; whether one has ended or reaches less far than before.
     #[inline(always)]
     fn meet_solid<M: Meeting>(&mut self, (item, mask): (Item, u64), meeting: &mut M) -> bool {
-        let mut is_changed = false;
+        let mut together = 0;
         for (k, asking) in groups(mask) {
-            let mut alone = asking;
             if asking.count_ones() >= FEWEST_IN_SOLID {
-                let group = (&mut self.groups[k], LANES * k);
-                let [counts, in_doubt] = meeting.cross_solid(group, &self.turn, asking, item);
-                if counts != 0 && M::ENDS {
-                    self.alive &= !(counts << (LANES * k));
-                } else if counts != 0 {
-                    self.shortened |= 1 << k;
-                }
-                is_changed |= counts != 0;
-                alone = in_doubt;
+                together |= asking << (LANES * k);
             }
-            for lane in lanes(alone) {
-                let place = LANES * k + lane;
-                let (shear, box_ray) = (self.shear(place), self.box_ray(place));
-                let step = meeting.ask(place, item, &shear, &box_ray);
-                is_changed |= self.take(place, &step);
+        }
+        let [mut counts, mut in_doubt] = [0; 2];
+        if together != 0 {
+            [counts, in_doubt] = meeting.cross_solid(&mut self.groups, &self.turn, together, item);
+        }
+        if M::ENDS {
+            self.alive &= !counts;
+        } else {
+            for (k, _) in groups(counts) {
+                self.shortened |= 1 << k;
             }
+        }
+        let mut is_changed = counts != 0;
+        for place in places(mask & !together | in_doubt) {
+            let (shear, box_ray) = (self.shear(place), self.box_ray(place));
+            let step = meeting.ask(place, item, &shear, &box_ray);
+            is_changed |= self.take(place, &step);
         }
         is_changed
     }
@@ -437,7 +439,7 @@ pub(super) fn places(mut mask: u64) -> impl Iterator<Item = usize> {
 
 /// The groups in which a mask has rays, each with its part of the mask.
 #[inline(always)]
-fn groups(mut mask: u64) -> impl Iterator<Item = (usize, u64)> {
+pub(super) fn groups(mut mask: u64) -> impl Iterator<Item = (usize, u64)> {
     std::iter::from_fn(move || {
         let k = mask.trailing_zeros() as usize / LANES % GROUPS;
         let asking = mask >> (LANES * k) & 0xFF;

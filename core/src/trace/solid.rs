@@ -509,7 +509,8 @@ mod tests {
         trace::{
             boxes::KernelWork,
             kernels::run_with_kernel,
-            lanes::{CLASSES, LANES, RayGroup, Turn, class_of},
+            lanes::{CLASSES, GROUPS, LANES, RayGroup, Turn, class_of},
+            solid_lanes::{MOST_LEAVES, SolidRays},
         },
     };
 
@@ -855,14 +856,60 @@ mod tests {
             let Self { solid, rays, most, found, .. } = self;
             let turn = Turn::new(&rays[0], &view.header.frame);
             let of_lanes = std::array::from_fn(|lane| &rays[lane.min(rays.len() - 1)]);
-            let mut group = RayGroup::EMPTY;
-            kernel.fill(&mut group, of_lanes, &turn);
+            let mut groups = [RayGroup::EMPTY; GROUPS];
+            kernel.fill(&mut groups[0], of_lanes, &turn);
             let asking = (u64::MAX >> (64 - rays.len()), self.skips_start);
             let take = |lane: usize, Crossing { t, part }| {
                 found[lane].push((t.to_bits(), part));
                 found[lane].len() == *most
             };
-            self.in_doubt = self.lanes.cross((view, solid), kernel, (&group, &turn), asking, take);
+            self.in_doubt = self.lanes.cross((view, solid), kernel, (&groups, &turn), asking, take);
+        }
+    }
+
+    /// All that a kernel finds of a group's rays at a solid.
+    impl KernelWork<View<'_>> for (&[Ray], Vec<String>) {
+        fn run(&mut self, view: &View<'_>, kernel: impl BoxKernel) {
+            let (rays, found) = self;
+            let solid = &view.solids[0];
+            let turn = Turn::new(&rays[0], &view.header.frame);
+            let mut group = RayGroup::EMPTY;
+            let of_lanes = std::array::from_fn(|lane| &rays[lane.min(rays.len() - 1)]);
+            kernel.fill(&mut group, of_lanes, &turn);
+            let mut near = [SolidRays::EMPTY];
+            let any_leaves = kernel.approach(&mut near[0], (&group, &turn), solid);
+            let beam = kernel.surround_near(&near, turn.is_forward);
+            found.push(format!("{near:?} {any_leaves} {beam:?}"));
+            for node in view.solid_boxes {
+                found.push(format!("{:b}", kernel.touch_beam(node, &beam)));
+                for child in 0..8 {
+                    let planes = |sides: [usize; 3]| sides.map(|side| node.planes[side][child]);
+                    let planes = [planes(beam.beam.near), planes(beam.beam.far)];
+                    found.push(format!("{}", kernel.touch(&near, (&[(0, u8::MAX)], 1), planes)));
+                }
+            }
+            let mut all_ends = Vec::new();
+            let apart = solid.margin / 1024.0;
+            for leaf in view.solid_leaves(solid).iter().take(MOST_LEAVES) {
+                let mut ends = [[0.0; LANES]; 2];
+                let met = if leaf.is_sphere() {
+                    kernel.meet_ball(&near[0], leaf, (any_leaves, apart), &mut ends)
+                } else {
+                    let planes = &view.box_planes[leaf.surface as usize];
+                    kernel.meet_box(&near[0], planes, (any_leaves, apart), &mut ends)
+                };
+                found.push(format!("{met:?}"));
+                all_ends.push(ends);
+            }
+            let (mut at, mut next) = (near[0].left_at, [0.0; LANES]);
+            for _ in 0..3 {
+                let mut inside = [0; MOST_LEAVES];
+                let places = (&at, &near[0].near.reach, apart);
+                let seen = kernel.look(&all_ends, places, &mut inside, &mut next);
+                found.push(format!("{seen:?} {inside:?} {next:?}"));
+                at = next;
+            }
+            found.push(format!("{all_ends:?}"));
         }
     }
 
@@ -967,6 +1014,16 @@ mod tests {
                 let found = check_group(&view, &mut lanes, (rays, k % 2 == 0), &what);
                 told += found[0];
                 in_doubt += found[1];
+                if groups % 16 == 0 {
+                    let isas = Isa::ALL.into_iter().filter(|isa| isa.is_supported());
+                    let found = isas.map(|isa| {
+                        let mut found = (rays, Vec::new());
+                        run_with_kernel(isa, &view, &mut found);
+                        found.1
+                    });
+                    let found: Vec<Vec<String>> = found.collect();
+                    assert!(found.iter().all(|it| *it == found[0]), "{what}: {found:#?}");
+                }
                 groups += 1;
             }
         }

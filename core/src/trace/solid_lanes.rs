@@ -5,13 +5,15 @@
 //! one on such bits. Rays in doubt are left to `Scratch::cross`. docs/proof.md says why all others
 //! are told what the plain evaluation tells.
 
+use glam::DVec3;
+
 use super::{
     boxes::BoxKernel,
     course::{Crossing, STEEP},
-    lane_faces::{cross_sphere, cross_sphere_again, leaves},
-    lanes::{LANES, RayGroup, Turn, larger, smaller},
-    packet::places,
+    lanes::{Beam, GROUPS, LANES, RayGroup, Turn, larger, smaller},
+    packet::{groups as asking_groups, places},
     ray::Ray,
+    sphere::{hit_sphere, hit_sphere_again},
 };
 use crate::prepared::{
     face::Part,
@@ -40,8 +42,16 @@ pub(super) struct SolidRays {
     pub(super) low: [f32; LANES],
     /// The rays themselves start here on their courses.
     pub(super) left_at: [f64; LANES],
-    /// The numbers of the surfaces that they leave, if any does.
+    /// The numbers of the surfaces that they leave.
     pub(super) leaving: [f64; LANES],
+}
+
+/// What the rays of some groups have near a solid, as a `Beam` has it.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct SolidBeam {
+    pub(super) beam: Beam,
+    /// The least.
+    pub(super) low: f32,
 }
 
 /// Which rays are where, a bit each.
@@ -66,7 +76,9 @@ struct Operand {
 /// Room for the rays of a group in a solid.
 #[derive(Debug)]
 pub(super) struct SolidLanes {
-    rays: SolidRays,
+    rays: [SolidRays; GROUPS],
+    /// The groups that meet a node of the hierarchy, a bit each.
+    waiting: [u8; SolidNodeRecord::BITS],
     /// The leaves that are met, in file order, and their nodes.
     leaves: [(u8, u8); MOST_LEAVES],
     /// Where rays enter and leave them.
@@ -81,16 +93,21 @@ pub(super) struct SolidLanes {
     operations: [(u8, u8); SolidNodeRecord::BITS],
 }
 
+impl SolidRays {
+    pub(super) const EMPTY: Self = Self {
+        near: RayGroup::EMPTY,
+        low: [0.0; LANES],
+        left_at: [0.0; LANES],
+        leaving: [0.0; LANES],
+    };
+}
+
 impl Default for SolidLanes {
     fn default() -> Self {
         let zeros = [0.0; LANES];
         Self {
-            rays: SolidRays {
-                near: RayGroup::EMPTY,
-                low: [0.0; LANES],
-                left_at: zeros,
-                leaving: zeros,
-            },
+            rays: [SolidRays::EMPTY; GROUPS],
+            waiting: [0; SolidNodeRecord::BITS],
             leaves: [(0, 0); MOST_LEAVES],
             ends: [[zeros; 2]; MOST_LEAVES],
             inside: [[0; MOST_LEAVES]; 2],
@@ -101,70 +118,15 @@ impl Default for SolidLanes {
     }
 }
 
-/// The axes of the rays' starts.
-const AXES: [usize; 3] = [0, 1, 2];
-
 impl SolidRays {
-    /// Brings the rays of a group near a solid, as `Course::new` does with each.
-    #[inline(always)]
-    fn approach(&mut self, (group, turn): (&RayGroup, &Turn), solid: &SolidRecord) {
-        let Self { near, low, left_at, leaving } = self;
-        for (axis, starts) in turn.axes.into_iter().zip(&group.origin) {
-            near.origin[axis % 3] = *starts;
-        }
-        (near.direction, near.leaving) = (group.direction, group.leaving);
-        (near.inverse, near.far_inverse) = (group.inverse, group.far_inverse);
-        let middle = &solid.frame.origin;
-        let ([x, y, z], [dx, dy, dz]) = (&near.origin, &near.direction);
-        let mut starts = [0.0; LANES];
-        for lane in 0..LANES {
-            let ahead = (middle[0] - x[lane]) * dx[lane]
-                + (middle[1] - y[lane]) * dy[lane]
-                + (middle[2] - z[lane]) * dz[lane];
-            starts[lane] = if ahead.abs() * solid.frame.scale > 8.0 { ahead } else { 0.0 };
-        }
-        let scale = solid.frame.scale;
-        for (axis, middle) in middle.iter().enumerate() {
-            let (origins, directions) = (&mut near.origin[axis], &near.direction[axis]);
-            let forward = turn.is_forward[axis];
-            for lane in 0..LANES {
-                origins[lane] += starts[lane] * directions[lane];
-                let place = ((origins[lane] - middle) * scale) as f32;
-                let slack = 2.0 * f32::EPSILON * place.abs() + 1e-25;
-                let [high, low] = [place + slack, place - slack];
-                near.near_origin[axis][lane] = if forward { high } else { low };
-                near.far_origin[axis][lane] = if forward { low } else { high };
-            }
-        }
-        for lane in 0..LANES {
-            left_at[lane] = -starts[lane];
-            near.reach[lane] = group.reach[lane] - starts[lane];
-            let first = ((left_at[lane] - 2.0 * solid.margin) * scale) as f32;
-            low[lane] = first - (2.0 * f32::EPSILON * first.abs() + 1e-25);
-            let last = ((near.reach[lane] + 2.0 * solid.margin) * scale) as f32;
-            near.high[lane] = last + (2.0 * f32::EPSILON * last.abs() + 1e-25);
-            leaving[lane] = f64::from(group.leaving[lane] as u32);
-        }
-    }
-
-    /// Whether some ray leaves a surface.
-    #[inline(always)]
-    fn any_leaves(&self) -> bool {
-        let mut all = u32::MAX;
-        for leaving in self.near.leaving {
-            all &= leaving as u32;
-        }
-        all != Surface::NONE.0
-    }
-
     /// A ray on its course, for which only its start, its direction and the surface that it leaves
     /// count.
     #[inline(always)]
     fn ray(&self, lane: usize) -> Ray {
         let RayGroup { origin: [x, y, z], direction: [dx, dy, dz], leaving, .. } = &self.near;
         Ray {
-            origin: glam::DVec3::new(x[lane], y[lane], z[lane]),
-            direction: glam::DVec3::new(dx[lane], dy[lane], dz[lane]),
+            origin: DVec3::new(x[lane], y[lane], z[lane]),
+            direction: DVec3::new(dx[lane], dy[lane], dz[lane]),
             leaving: Surface(leaving[lane] as u32),
             ..Ray::NOWHERE
         }
@@ -172,38 +134,68 @@ impl SolidRays {
 }
 
 impl SolidLanes {
-    /// Calls `take` with the lane for the crossings of the solid's surface by the rays `asking` of
-    /// a group, in order for each, until it says that this ray has enough; it is not told of
-    /// crossings at the start if that is so `wanted`. The solid has at most
-    /// [`SolidNodeRecord::BITS`] nodes. The rays that are in doubt, a bit each: what `take` was
-    /// told of them does not count.
+    /// Calls `take` with the place for the crossings of the solid's surface by the rays `asking` of
+    /// a packet, in order for each, until it says that this ray has enough; it is not told of
+    /// crossings at the start if `skips_start`. The solid has at most [`SolidNodeRecord::BITS`]
+    /// nodes. The rays that are in doubt, a bit each: what `take` was told of them does not count.
     #[inline(always)]
     pub(super) fn cross(
         &mut self,
-        (view, solid): (&View<'_>, &SolidRecord),
+        solid: (&View<'_>, &SolidRecord),
         kernel: impl BoxKernel,
-        rays: (&RayGroup, &Turn),
+        (groups, turn): (&[RayGroup; GROUPS], &Turn),
         (asking, skips_start): (u64, bool),
         mut take: impl FnMut(usize, Crossing) -> bool,
     ) -> u64 {
-        self.rays.approach(rays, solid);
-        let touched = self.touch((view, solid), kernel, asking, rays.1.is_forward);
-        if touched == 0 {
-            return 0;
+        // The groups that ask, each with the place of its first ray.
+        let (mut count, mut any_leaves) = (0, 0_u64);
+        let mut of_groups = [(0, 0_u8); GROUPS];
+        for (k, asking) in asking_groups(asking) {
+            let any = kernel.approach(&mut self.rays[count], (&groups[k], turn), solid.1);
+            any_leaves |= u64::from(any) << count;
+            of_groups[count] = (LANES * k, asking as u8);
+            count += 1;
         }
+        let of_groups = &of_groups[..count.min(GROUPS)];
+        let touched = self.touch(solid, kernel, of_groups, turn.is_forward);
+        let mut in_doubt = 0;
+        for (at, &(first, asking)) in of_groups.iter().enumerate() {
+            if touched[at] != 0 {
+                let any_leaves = any_leaves >> at & 1 == 1;
+                let asking = (u64::from(asking), skips_start);
+                let of_group = (at, touched[at], any_leaves);
+                let take = |lane: usize, crossing: Crossing| take(first + lane, crossing);
+                in_doubt |= self.cross_group(solid, kernel, of_group, asking, take) << first;
+            }
+        }
+        in_doubt
+    }
+
+    /// The same for one group, which touches some leaves.
+    #[inline(always)]
+    fn cross_group(
+        &mut self,
+        (view, solid): (&View<'_>, &SolidRecord),
+        kernel: impl BoxKernel,
+        (group, touched, any_leaves): (usize, u64, bool),
+        (asking, skips_start): (u64, bool),
+        mut take: impl FnMut(usize, Crossing) -> bool,
+    ) -> u64 {
         if touched.count_ones() as usize > MOST_LEAVES {
             return asking;
         }
         let apart = solid.margin / 1024.0;
-        let (count, mut in_doubt) = self.meet((view, solid), kernel, asking, (touched, apart));
+        let met = (group, asking, any_leaves);
+        let (count, mut in_doubt) = self.meet((view, solid), kernel, met, (touched, apart));
         let mut alive = asking & !in_doubt;
         if count == 0 || alive == 0 {
             return in_doubt;
         }
-        let root = view.solid_nodes(solid).len() - 1;
-        let (operand_count, operation_count) = self.link(view.solid_nodes(solid), count);
-        let Self { rays, leaves, ends, inside, inside_nodes, operands, operations } = self;
-        let (leaves, ends) = (&leaves[..count], &ends[..count]);
+        let nodes = view.solid_nodes(solid);
+        let root = nodes.len() - 1;
+        let (operand_count, operation_count) = self.link(nodes, count);
+        let Self { rays, leaves, ends, inside, inside_nodes, operands, operations, .. } = self;
+        let (rays, leaves, ends) = (&rays[group], &leaves[..count], &ends[..count]);
         let (operands, operations) = (&operands[..operand_count], &operations[..operation_count]);
         // Before the first end that counts; none may be so near to the start that it is in one
         // doubt with what lies behind.
@@ -220,11 +212,14 @@ impl SolidLanes {
         let [mut before, mut after] = [0, 1];
         let seen = kernel.look(ends, (&first, reach, 0.0), &mut inside[before], &mut at);
         alive &= seen.ahead;
-        combine(leaves, operands, operations, &inside[before], &mut inside_nodes[before]);
         for lane in 0..LANES {
             in_doubt |= u64::from(at[lane] < bound[lane]) << lane & alive;
         }
         alive &= !in_doubt;
+        if alive == 0 {
+            return in_doubt;
+        }
+        combine(leaves, operands, operations, &inside[before], &mut inside_nodes[before]);
         while alive != 0 {
             let seen = kernel.look(ends, (&at, reach, apart), &mut inside[after], &mut next);
             in_doubt |= seen.near & alive;
@@ -232,64 +227,90 @@ impl SolidLanes {
             combine(leaves, operands, operations, &inside[after], &mut inside_nodes[after]);
             let [was, is] = [&inside_nodes[before], &inside_nodes[after]];
             let crossing = u64::from(was[root] ^ is[root]) & alive;
-            for lane in places(crossing) {
-                let lane = lane % LANES;
-                let bits = [&inside[before], &inside[after]];
-                let row = changed_row(bits, count, lane).unwrap_or_else(|| {
-                    let nodes = view.solid_nodes(solid);
-                    let node = changed_leaf(nodes, operands, [was, is], lane);
-                    leaves.iter().position(|&(_, of_row)| of_row == node).unwrap_or(0)
-                });
-                let number = u32::from(leaves[row].0);
-                let enters = inside[after][row] >> lane & 1 == 1;
-                let leaf = &view.solid_leaves(solid)[number as usize];
-                let face = if leaf.is_sphere() {
-                    0
-                } else {
-                    let planes = &view.box_planes[leaf.surface as usize];
-                    let ray = (&rays.ray(lane), rays.left_at[lane]);
-                    kernel.face_at(ray, planes, at[lane], enters)
-                };
-                let t = -rays.left_at[lane] + at[lane];
-                if take(lane, Crossing { t, part: Part::new(number, face) }) {
-                    alive &= !(1 << lane);
+            let mut enough = 0;
+            if crossing != 0 {
+                // The leaf at the crossing of each; the rays that come to any leaf, and to several.
+                let mut rows = [0_u8; LANES];
+                let [mut any, mut several] = [0; 2];
+                let changes = inside[before].iter().zip(&inside[after]).take(count);
+                for (row, (was, is)) in (0..).zip(changes) {
+                    let changed = was ^ is;
+                    several |= any & changed;
+                    any |= changed;
+                    for lane in places(u64::from(changed) & crossing) {
+                        rows[lane % LANES] = row;
+                    }
+                }
+                // One place that tells: it is compiled for the kernel.
+                for lane in places(crossing) {
+                    let lane = lane % LANES;
+                    let mut row = usize::from(rows[lane]) % MOST_LEAVES;
+                    if several >> lane & 1 == 1 {
+                        let node = changed_leaf(nodes, operands, [was, is], lane);
+                        row = leaves.iter().position(|&(_, of_row)| of_row == node).unwrap_or(row);
+                    }
+                    let number = u32::from(leaves[row].0);
+                    let leaf = &view.solid_leaves(solid)[number as usize];
+                    let face = if leaf.is_sphere() {
+                        0
+                    } else {
+                        let planes = &view.box_planes[leaf.surface as usize];
+                        let enters = inside[after][row] >> lane & 1 == 1;
+                        let ray = (&rays.ray(lane), rays.left_at[lane]);
+                        kernel.face_at(ray, planes, at[lane], enters)
+                    };
+                    let t = -rays.left_at[lane] + at[lane];
+                    let crossing = Crossing { t, part: Part::new(number, face) };
+                    enough |= u64::from(take(lane, crossing)) << lane;
                 }
             }
-            alive &= seen.ahead;
+            alive &= seen.ahead & !enough;
             std::mem::swap(&mut at, &mut next);
             std::mem::swap(&mut before, &mut after);
         }
         in_doubt
     }
 
-    /// The leaves whose boxes some ray touches, a bit each.
+    /// The leaves whose boxes some ray of each group touches, a bit each.
     #[inline(always)]
     fn touch(
-        &self,
+        &mut self,
         (view, solid): (&View<'_>, &SolidRecord),
         kernel: impl BoxKernel,
-        asking: u64,
+        groups: &[(usize, u8)],
         is_forward: [bool; 3],
-    ) -> u64 {
-        let bit = |index: usize| 1_u64.checked_shl(index as u32).unwrap_or(0);
-        let [mut near, mut far] = [[0; 3]; 2];
-        for axis in 0..3 {
-            let [low, high] = [axis, axis + 3];
-            [near[axis], far[axis]] = if is_forward[axis] { [low, high] } else { [high, low] };
-        }
+    ) -> [u64; GROUPS] {
+        let mut touched = [0; GROUPS];
+        let rays = &self.rays[..groups.len()];
+        let beam = kernel.surround_near(rays, is_forward);
         let first = solid.first_box as usize;
-        let (mut touched, mut waiting) = (0, 1_u64);
+        self.waiting[0] = u8::MAX >> (GROUPS - groups.len());
+        let mut waiting = 1_u64;
         while waiting != 0 {
-            let node = &view.solid_boxes[first + waiting.trailing_zeros() as usize];
+            let index = waiting.trailing_zeros() as usize % SolidNodeRecord::BITS;
             waiting &= waiting - 1;
-            let mut met = kernel.touch(&self.rays, node, [near, far], asking);
+            let node = &view.solid_boxes[first + index];
+            let of_node = self.waiting[index];
+            let mut met = kernel.touch_beam(node, &beam);
             while met != 0 {
-                let child = node.children[met.trailing_zeros() as usize & 7];
+                let place = met.trailing_zeros() as usize & 7;
                 met &= met - 1;
+                let child = node.children[place];
+                let planes = |sides: [usize; 3]| sides.map(|side| node.planes[side][place]);
+                let planes = [planes(beam.beam.near), planes(beam.beam.far)];
+                let of_child = kernel.touch(rays, (groups, of_node), planes);
+                if of_child == 0 {
+                    continue;
+                }
                 if child.is_leaf() {
-                    touched |= bit(child.items().start);
+                    let bit = 1_u64.checked_shl(child.items().start as u32).unwrap_or(0);
+                    for k in places(of_child.into()) {
+                        touched[k % GROUPS] |= bit;
+                    }
                 } else {
-                    waiting |= bit(child.node() - first);
+                    let index = (child.node() - first) % SolidNodeRecord::BITS;
+                    self.waiting[index] = of_child;
+                    waiting |= 1 << index;
                 }
             }
         }
@@ -302,10 +323,10 @@ impl SolidLanes {
         &mut self,
         (view, solid): (&View<'_>, &SolidRecord),
         kernel: impl BoxKernel,
-        asking: u64,
+        (group, asking, any_leaves): (usize, u64, bool),
         (mut touched, apart): (u64, f64),
     ) -> (usize, u64) {
-        let any_leaves = self.rays.any_leaves();
+        let rays = &self.rays[group];
         let (mut count, mut in_doubt) = (0, 0);
         while touched != 0 {
             let number = touched.trailing_zeros();
@@ -313,10 +334,10 @@ impl SolidLanes {
             let leaf = &view.solid_leaves(solid)[number as usize];
             let ends = &mut self.ends[count % MOST_LEAVES];
             let met = if leaf.is_sphere() {
-                self.rays.meet_sphere(leaf, (any_leaves, apart), ends)
+                kernel.meet_ball(rays, leaf, (any_leaves, apart), ends)
             } else {
                 let planes = &view.box_planes[leaf.surface as usize];
-                kernel.meet_box(&self.rays, planes, (any_leaves, apart), ends)
+                kernel.meet_box(rays, planes, (any_leaves, apart), ends)
             };
             in_doubt |= met.in_doubt & asking;
             if met.met & asking == 0 {
@@ -403,21 +424,6 @@ fn combine(
     }
 }
 
-/// The one leaf that a ray enters or leaves in a step; `None` if there are several.
-#[inline(always)]
-fn changed_row([was, is]: [&[u8; MOST_LEAVES]; 2], count: usize, lane: usize) -> Option<usize> {
-    let mut found = None;
-    for row in 0..count.min(MOST_LEAVES) {
-        if (was[row] ^ is[row]) >> lane & 1 == 1 {
-            if found.is_some() {
-                return None;
-            }
-            found = Some(row);
-        }
-    }
-    found
-}
-
 /// The node of the leaf whose face is there where a ray enters or leaves the root in a step with
 /// several leaves: at each operation the first operand that made it change.
 #[cold]
@@ -447,48 +453,153 @@ fn changed_leaf(
     }
 }
 
-impl SolidRays {
-    /// The rays meet a sphere, as `Course::sure_stretch` has it for one.
-    #[inline(always)]
-    fn meet_sphere(
-        &self,
-        leaf: &LeafRecord,
-        (any_leaves, apart): (bool, f64),
-        ends: &mut [[f64; LANES]; 2],
-    ) -> Met {
-        let sphere = cross_sphere(&self.near, AXES, &leaf.center, leaf.radius);
-        let (mut enters, mut exits) = (sphere.near, sphere.far);
-        let mut met = Met { met: sphere.met, in_doubt: 0 };
-        if any_leaves {
-            let (leaves, _) = leaves(&self.near, leaf.surface, 0);
-            if leaves != 0 {
-                let again = cross_sphere_again(&self.near, AXES, &leaf.center);
-                for lane in places(leaves) {
-                    let lane = lane % LANES;
-                    // What starts far off is left to who knows where that is.
-                    met.in_doubt |= u64::from(self.left_at[lane] != 0.0) << lane;
-                    [enters[lane], exits[lane]] = [again[lane].min(0.0), again[lane].max(0.0)];
-                }
-                met.met |= leaves;
-            }
-        }
-        if met.met == 0 {
-            return met;
-        }
-        let least = larger_f64(apart, STEEP * 2.0 * leaf.radius);
-        let [of_enters, of_exits] = ends;
-        for lane in 0..LANES {
-            let is_met = met.met >> lane & 1 == 1 && enters[lane] < exits[lane];
-            of_enters[lane] = if is_met { enters[lane] } else { NOWHERE[0] };
-            of_exits[lane] = if is_met { exits[lane] } else { NOWHERE[1] };
-            met.in_doubt |= u64::from(is_met && exits[lane] - enters[lane] <= least) << lane;
-        }
-        met
+/// `BoxKernel::approach` in plain Rust.
+#[inline(always)]
+pub(super) fn approach(
+    rays: &mut SolidRays,
+    (group, turn): (&RayGroup, &Turn),
+    solid: &SolidRecord,
+) -> bool {
+    let SolidRays { near, low, left_at, leaving } = rays;
+    for (axis, starts) in turn.axes.into_iter().zip(&group.origin) {
+        near.origin[axis % 3] = *starts;
     }
+    (near.direction, near.leaving) = (group.direction, group.leaving);
+    (near.inverse, near.far_inverse) = (group.inverse, group.far_inverse);
+    let (middle, scale) = (&solid.frame.origin, solid.frame.scale);
+    let ([x, y, z], [dx, dy, dz]) = (&near.origin, &near.direction);
+    let mut starts = [0.0; LANES];
+    for lane in 0..LANES {
+        let ahead = (middle[0] - x[lane]) * dx[lane]
+            + (middle[1] - y[lane]) * dy[lane]
+            + (middle[2] - z[lane]) * dz[lane];
+        starts[lane] = if ahead.abs() * scale > 8.0 { ahead } else { 0.0 };
+    }
+    for (axis, middle) in middle.iter().enumerate() {
+        let (origins, directions) = (&mut near.origin[axis], &near.direction[axis]);
+        let forward = turn.is_forward[axis];
+        for lane in 0..LANES {
+            origins[lane] += starts[lane] * directions[lane];
+            let place = ((origins[lane] - middle) * scale) as f32;
+            let [low, high] = [place - slack(place), place + slack(place)];
+            near.near_origin[axis][lane] = if forward { high } else { low };
+            near.far_origin[axis][lane] = if forward { low } else { high };
+        }
+    }
+    let mut any_leaves = false;
+    for lane in 0..LANES {
+        left_at[lane] = -starts[lane];
+        near.reach[lane] = group.reach[lane] - starts[lane];
+        let first = ((left_at[lane] - 2.0 * solid.margin) * scale) as f32;
+        low[lane] = first - slack(first);
+        let last = ((near.reach[lane] + 2.0 * solid.margin) * scale) as f32;
+        near.high[lane] = last + slack(last);
+        leaving[lane] = f64::from(group.leaving[lane] as u32);
+        any_leaves |= group.leaving[lane] as u32 != Surface::NONE.0;
+    }
+    any_leaves
 }
 
-fn larger_f64(a: f64, b: f64) -> f64 {
-    if a > b { a } else { b }
+/// More than rounding to f32 takes from a number.
+fn slack(number: f32) -> f32 {
+    SLACK * number.abs() + LEAST_SLACK
+}
+
+pub(super) const SLACK: f32 = 2.0 * f32::EPSILON;
+pub(super) const LEAST_SLACK: f32 = 1e-25;
+
+/// The part of the squared radius by which rounding may move a ray that touches a sphere, and more.
+pub(super) const TOUCHED: f64 = 1.0 + 1e-12;
+
+/// `BoxKernel::meet_ball` in plain Rust.
+#[inline(always)]
+pub(super) fn meet_ball(
+    rays: &SolidRays,
+    leaf: &LeafRecord,
+    (any_leaves, apart): (bool, f64),
+    [enters, exits]: &mut [[f64; LANES]; 2],
+) -> Met {
+    let mut met = Met::default();
+    let least = least_chord(leaf, apart);
+    for lane in 0..LANES {
+        let ray = rays.ray(lane);
+        let center = DVec3::from_array(leaf.center);
+        let [enter, exit] = if any_leaves && ray.leaving == Surface(leaf.surface) {
+            // What starts far off is left to who knows where that is.
+            met.in_doubt |= u64::from(rays.left_at[lane] != 0.0) << lane;
+            let again = hit_sphere_again(&ray, center);
+            [if again < 0.0 { again } else { 0.0 }, if again > 0.0 { again } else { 0.0 }]
+        } else {
+            hit_sphere(&ray, center, leaf.radius).unwrap_or(NOWHERE)
+        };
+        let is_met = enter < exit;
+        met.met |= u64::from(is_met) << lane;
+        met.in_doubt |= u64::from(is_met && exit - enter <= least) << lane;
+        [enters[lane], exits[lane]] = if is_met { [enter, exit] } else { NOWHERE };
+    }
+    met
+}
+
+/// Rays that are inside a sphere no longer than this are in doubt.
+#[inline(always)]
+pub(super) fn least_chord(leaf: &LeafRecord, apart: f64) -> f64 {
+    let grazing = STEEP * 2.0 * leaf.radius;
+    if grazing > apart { grazing } else { apart }
+}
+
+/// `BoxKernel::surround_near` in plain Rust.
+#[inline(always)]
+pub(super) fn surround_near(rays: &[SolidRays], is_forward: [bool; 3]) -> SolidBeam {
+    let mut low = f32::INFINITY;
+    for lows in rays.iter().map(|rays| &rays.low) {
+        for &of_lane in lows {
+            low = smaller(of_lane, low);
+        }
+    }
+    let mut beam = Beam::EMPTY;
+    beam.high = f32::NEG_INFINITY;
+    for (axis, forward) in is_forward.into_iter().enumerate() {
+        let mut starts = if forward {
+            [f32::NEG_INFINITY, f32::INFINITY]
+        } else {
+            [f32::INFINITY, f32::NEG_INFINITY]
+        };
+        let mut inverses = [f32::INFINITY, f32::NEG_INFINITY];
+        for group in rays.iter().map(|rays| &rays.near) {
+            for lane in 0..LANES {
+                let [near, far] = [group.near_origin[axis][lane], group.far_origin[axis][lane]];
+                starts = if forward {
+                    [larger(near, starts[0]), smaller(far, starts[1])]
+                } else {
+                    [smaller(near, starts[0]), larger(far, starts[1])]
+                };
+                let inverse = group.inverse[axis][lane];
+                inverses = [smaller(inverse, inverses[0]), larger(inverse, inverses[1])];
+                beam.high = larger(group.high[lane], beam.high);
+            }
+        }
+        beam.set_axis((axis, forward), starts, inverses);
+    }
+    SolidBeam { beam, low }
+}
+
+/// `BoxKernel::touch_beam` in plain Rust.
+#[inline(always)]
+pub(super) fn touch_beam(node: &Node, SolidBeam { beam, low }: &SolidBeam) -> u32 {
+    let mut mask = 0;
+    for child in 0..node.children.len() {
+        let (mut enter, mut leave) = (*low, beam.high);
+        for axis in 0..3 {
+            let near = node.planes[beam.near[axis]][child] - beam.near_origin[axis];
+            let far = node.planes[beam.far[axis]][child] - beam.far_origin[axis];
+            let [a, b] = beam.inverse[axis];
+            enter = larger(smaller(near * a, near * b), enter);
+            let [a, b] = beam.far_inverse[axis];
+            leave = smaller(larger(far * a, far * b), leave);
+        }
+        mask |= u32::from(enter <= leave) << child;
+    }
+    mask
 }
 
 /// What the rays are to what comes next.
@@ -503,28 +614,27 @@ pub(super) struct Seen {
 /// `BoxKernel::touch` in plain Rust.
 #[inline(always)]
 pub(super) fn touch(
-    rays: &SolidRays,
-    node: &Node,
-    [near, far]: [[usize; 3]; 2],
-    asking: u64,
-) -> u32 {
-    let group = &rays.near;
-    let mut touched = 0;
-    for (child, _) in node.children.iter().enumerate() {
+    rays: &[SolidRays],
+    (groups, asking): (&[(usize, u8)], u8),
+    [near, far]: [[f32; 3]; 2],
+) -> u8 {
+    let mut touching = 0;
+    for (k, (rays, (_, of_group))) in rays.iter().zip(groups).enumerate() {
+        let group = &rays.near;
         let mut met = 0;
         for lane in 0..LANES {
             let (mut enter, mut leave) = (rays.low[lane], group.high[lane]);
             for axis in 0..3 {
-                let to_near = node.planes[near[axis]][child] - group.near_origin[axis][lane];
-                let to_far = node.planes[far[axis]][child] - group.far_origin[axis][lane];
+                let to_near = near[axis] - group.near_origin[axis][lane];
+                let to_far = far[axis] - group.far_origin[axis][lane];
                 enter = larger(to_near * group.inverse[axis][lane], enter);
                 leave = smaller(to_far * group.far_inverse[axis][lane], leave);
             }
-            met |= u64::from(enter <= leave) << lane;
+            met |= u8::from(enter <= leave) << lane;
         }
-        touched |= u32::from(met & asking != 0) << child;
+        touching |= u8::from(met & of_group != 0) << k;
     }
-    touched
+    touching & asking
 }
 
 /// `BoxKernel::meet_box` in plain Rust.
