@@ -32,7 +32,7 @@ const FEW: u32 = 2;
 const FEW_TO_SIFT: u32 = 8;
 
 /// Fewer rays of a group than this meet a solid each alone.
-const FEWEST_IN_SOLID: u32 = 2;
+const FEWEST_IN_SOLID: u32 = 4;
 
 /// Lines that pass by a point by no more than this part of the frame have it as a focus.
 const MOST_SPREAD: f64 = 1.0 / (1_u64 << 20) as f64;
