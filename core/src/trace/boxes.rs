@@ -11,7 +11,7 @@ use super::{
     },
     parallelepiped::PlaneCrossings,
     ray::{Ray, Shear},
-    solid_lanes::{self, MOST_LEAVES, Met, Seen, SolidBeam, SolidRays},
+    solid_rays::{self, MOST_LEAVES, Met, Seen, SolidBeam, SolidRays},
 };
 use crate::prepared::{
     node::{Frame, Node},
@@ -153,26 +153,26 @@ pub(super) trait BoxKernel: Copy {
         group: (&RayGroup, &Turn),
         solid: &SolidRecord,
     ) -> bool {
-        solid_lanes::approach(rays, group, solid)
+        solid_rays::approach(rays, group, solid)
     }
 
     /// The beam of rays near a solid, which go forward on these axes.
     #[inline(always)]
     fn surround_near(self, rays: &[SolidRays], is_forward: [bool; 3]) -> SolidBeam {
-        solid_lanes::surround_near(rays, is_forward)
+        solid_rays::surround_near(rays, is_forward)
     }
 
     /// The boxes of a node that some ray may touch, a bit each.
     #[inline(always)]
     fn touch_beam(self, node: &Node, beam: &SolidBeam) -> u32 {
-        solid_lanes::touch_beam(node, beam)
+        solid_rays::touch_beam(node, beam)
     }
 
     /// The groups `asking` of which some ray that asks touches the box between three near and three
     /// far planes, a bit each.
     #[inline(always)]
     fn touch(self, rays: &[SolidRays], asking: (&[(usize, u8)], u8), planes: [[f32; 3]; 2]) -> u8 {
-        solid_lanes::touch(rays, asking, planes)
+        solid_rays::touch(rays, asking, planes)
     }
 
     /// Where rays enter and leave a sphere, as `Course::sure_stretch` finds it for those that are
@@ -185,7 +185,7 @@ pub(super) trait BoxKernel: Copy {
         (any_leaves, apart): (bool, f64),
         ends: &mut [[f64; LANES]; 2],
     ) -> Met {
-        solid_lanes::meet_ball(rays, leaf, (any_leaves, apart), ends)
+        solid_rays::meet_ball(rays, leaf, (any_leaves, apart), ends)
     }
 
     /// Where rays enter and leave a parallelepiped; as [`BoxKernel::cross_box`] finds it for those
@@ -198,7 +198,7 @@ pub(super) trait BoxKernel: Copy {
         (any_leaves, apart): (bool, f64),
         ends: &mut [[f64; LANES]; 2],
     ) -> Met {
-        solid_lanes::meet_box(rays, planes, (any_leaves, apart), ends)
+        solid_rays::meet_box(rays, planes, (any_leaves, apart), ends)
     }
 
     /// Finds what rays are inside of just behind the places where they are `at`, and their `next`
@@ -211,7 +211,7 @@ pub(super) trait BoxKernel: Copy {
         inside: &mut [u8; MOST_LEAVES],
         next: &mut [f64; LANES],
     ) -> Seen {
-        solid_lanes::look(ends, places, inside, next)
+        solid_rays::look(ends, places, inside, next)
     }
 
     /// Takes the numbers that are `t` out of four, so that they become infinite: a bit for each.

@@ -13,7 +13,7 @@ use super::{
     boxes_x86::Avx2Boxes,
     lanes::{Beam, Crossings, FACES, Focus, GROUPS, LANES, RayGroup, Sieve, Turn},
     ray::{Ray, Shear},
-    solid_lanes::{MOST_LEAVES, Met, Seen, SolidBeam, SolidRays},
+    solid_rays::{MOST_LEAVES, Met, Seen, SolidBeam, SolidRays},
 };
 use crate::prepared::{
     node::{Frame, Node},

@@ -27,8 +27,7 @@ use super::{
     },
     parallelepiped_x86,
     ray::{Ray, Shear},
-    solid_lanes::{MOST_LEAVES, Met, Seen, SolidBeam, SolidRays},
-    solid_lanes_x86,
+    solid_rays::{MOST_LEAVES, Met, Seen, SolidBeam, SolidRays},
 };
 use crate::prepared::{
     node::{Frame, Node},
@@ -136,25 +135,25 @@ impl BoxKernel for Avx2Boxes {
         solid: &SolidRecord,
     ) -> bool {
         // SAFETY: a value of this type says that the CPU has AVX2.
-        unsafe { solid_lanes_x86::approach_with_avx2(rays, group, solid) }
+        unsafe { parallelepiped_x86::approach_with_avx2(rays, group, solid) }
     }
 
     #[inline(always)]
     fn surround_near(self, rays: &[SolidRays], is_forward: [bool; 3]) -> SolidBeam {
         // SAFETY: a value of this type says that the CPU has AVX2.
-        unsafe { solid_lanes_x86::surround_near_with_avx2(rays, is_forward) }
+        unsafe { parallelepiped_x86::surround_near_with_avx2(rays, is_forward) }
     }
 
     #[inline(always)]
     fn touch_beam(self, node: &Node, beam: &SolidBeam) -> u32 {
         // SAFETY: a value of this type says that the CPU has AVX2.
-        unsafe { solid_lanes_x86::touch_beam_with_avx2(node, beam) }
+        unsafe { parallelepiped_x86::touch_beam_with_avx2(node, beam) }
     }
 
     #[inline(always)]
     fn touch(self, rays: &[SolidRays], asking: (&[(usize, u8)], u8), planes: [[f32; 3]; 2]) -> u8 {
         // SAFETY: a value of this type says that the CPU has AVX2.
-        unsafe { solid_lanes_x86::touch_with_avx2(rays, asking, planes) }
+        unsafe { parallelepiped_x86::touch_with_avx2(rays, asking, planes) }
     }
 
     #[inline(always)]
@@ -168,9 +167,9 @@ impl BoxKernel for Avx2Boxes {
         // SAFETY: a value of this type says that the CPU has AVX2.
         unsafe {
             if any_leaves {
-                solid_lanes_x86::meet_ball_with_avx2::<true>(rays, leaf, apart, ends)
+                parallelepiped_x86::meet_ball_with_avx2::<true>(rays, leaf, apart, ends)
             } else {
-                solid_lanes_x86::meet_ball_with_avx2::<false>(rays, leaf, apart, ends)
+                parallelepiped_x86::meet_ball_with_avx2::<false>(rays, leaf, apart, ends)
             }
         }
     }
@@ -186,9 +185,9 @@ impl BoxKernel for Avx2Boxes {
         // SAFETY: a value of this type says that the CPU has AVX2.
         unsafe {
             if any_leaves {
-                solid_lanes_x86::meet_box_with_avx2::<true>(rays, planes, apart, ends)
+                parallelepiped_x86::meet_box_with_avx2::<true>(rays, planes, apart, ends)
             } else {
-                solid_lanes_x86::meet_box_with_avx2::<false>(rays, planes, apart, ends)
+                parallelepiped_x86::meet_box_with_avx2::<false>(rays, planes, apart, ends)
             }
         }
     }
@@ -202,7 +201,7 @@ impl BoxKernel for Avx2Boxes {
         next: &mut [f64; LANES],
     ) -> Seen {
         // SAFETY: a value of this type says that the CPU has AVX2.
-        unsafe { solid_lanes_x86::look_with_avx2(ends, places, inside, next) }
+        unsafe { parallelepiped_x86::look_with_avx2(ends, places, inside, next) }
     }
 
     #[inline(always)]

@@ -26,9 +26,7 @@ pub(crate) mod quadrangle;
 pub(crate) mod ray;
 pub(crate) mod solid;
 mod solid_lanes;
-#[cfg(target_arch = "x86_64")]
-#[expect(unsafe_code, reason = "SIMD intrinsics")]
-mod solid_lanes_x86;
+mod solid_rays;
 pub(crate) mod sphere;
 pub(crate) mod timed;
 pub(crate) mod traversal;

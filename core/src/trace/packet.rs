@@ -13,7 +13,9 @@ use super::{
     box_ray::BoxRay,
     boxes::BoxKernel,
     lane_faces::{cross_plane, cross_sphere, cross_sphere_again, leaves, pass_quadrangle},
-    lanes::{Beam, Focus, GROUPS, LANES, MOST_RAYS, RayGroup, Turn, larger, shear_at},
+    lanes::{
+        Beam, Focus, GROUPS, LANES, MOST_RAYS, RayGroup, Turn, groups, larger, places, shear_at,
+    },
     lone::step,
     meeting::Meeting,
     ray::{Ray, Shear},
@@ -423,29 +425,6 @@ fn start_together(groups: &[RayGroup]) -> bool {
         }
     }
     true
-}
-
-/// The bits of a mask.
-#[inline(always)]
-pub(super) fn places(mut mask: u64) -> impl Iterator<Item = usize> {
-    std::iter::from_fn(move || {
-        let place = mask.trailing_zeros() as usize;
-        (mask != 0).then(|| {
-            mask &= mask - 1;
-            place % MOST_RAYS
-        })
-    })
-}
-
-/// The groups in which a mask has rays, each with its part of the mask.
-#[inline(always)]
-pub(super) fn groups(mut mask: u64) -> impl Iterator<Item = (usize, u64)> {
-    std::iter::from_fn(move || {
-        let k = mask.trailing_zeros() as usize / LANES % GROUPS;
-        let asking = mask >> (LANES * k) & 0xFF;
-        mask &= !(0xFF << (LANES * k));
-        (asking != 0).then_some((k, asking))
-    })
 }
 
 /// The lanes of a group's part of a mask.

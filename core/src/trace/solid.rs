@@ -510,7 +510,7 @@ mod tests {
             boxes::KernelWork,
             kernels::run_with_kernel,
             lanes::{CLASSES, GROUPS, LANES, RayGroup, Turn, class_of},
-            solid_lanes::{MOST_LEAVES, SolidRays},
+            solid_rays::{MOST_LEAVES, SolidRays},
         },
     };
 
