@@ -8,12 +8,16 @@ use std::ops::ControlFlow;
 use super::{
     box_ray::BoxRay,
     boxes::{BoxKernel, KernelWork},
-    hit::{Nearest, between, is_between, take, take_crossing, take_quadrangle, take_sphere},
+    course::Crossing,
+    hit::{
+        Nearest, between, counts, cross_solid_together, is_between, take, take_crossing,
+        take_quadrangle, take_sphere,
+    },
     kernels::run_with_kernel,
-    lanes::{CLASSES, LANES, MOST_RAYS, RayGroup},
+    lanes::{CLASSES, GROUPS, LANES, MOST_RAYS, RayGroup, Turn, places},
     lone::{Flights, visit_alone},
     meeting::Meeting,
-    packet::{Packet, PacketStack, places, visit_packet},
+    packet::{Packet, PacketStack, visit_packet},
     ray::{Hit, Ray, Shear},
     solid::Scratch,
     traversal::{Stack, Step},
@@ -294,6 +298,37 @@ impl<K: BoxKernel> Meeting for NearestOfPacket<'_, K> {
     }
 
     #[inline(always)]
+    fn cross_solid(
+        &mut self,
+        groups: &mut [RayGroup; GROUPS],
+        turn: &Turn,
+        asking: u64,
+        item: Item,
+    ) -> [u64; 2] {
+        let Self { view, kernel, rays, members, hits, scratch } = self;
+        let solid = &view.solids[item.index()];
+        let mut met = 0;
+        let take = |place: usize, crossing: Crossing| {
+            let member = usize::from(members[place]);
+            let is_met = counts(view, solid, &rays[member], crossing);
+            let Crossing { t, part } = crossing;
+            if is_met && take(&mut hits[member], item, (t, part.rank(solid), part)) {
+                met |= 1 << place;
+            }
+            is_met
+        };
+        let skips_start = places(asking)
+            .all(|place| groups[place / LANES].after[place % LANES] == Ray::NOTHING_AHEAD);
+        let (rays, asking) = ((&*groups, turn), (asking, skips_start));
+        let in_doubt = cross_solid_together(*kernel, (view, item), rays, asking, scratch, take);
+        for place in places(met) {
+            let reach = hits[usize::from(members[place])].t;
+            groups[place / LANES].reach[place % LANES] = reach;
+        }
+        [met, in_doubt]
+    }
+
+    #[inline(always)]
     fn ask(&mut self, place: usize, item: Item, shear: &Shear, box_ray: &BoxRay) -> Step {
         let member = usize::from(self.members[place]);
         let hit = &mut self.hits[member];
@@ -463,6 +498,42 @@ impl<K: BoxKernel> Meeting for BlockedOfPacket<'_, K> {
     fn cross_quadrangle(&mut self, place: usize, item: Item, t: f64) -> Step {
         let reach = self.rays[usize::from(self.members[place])].reach;
         self.block(place, item, usize::from(t < reach))
+    }
+
+    #[inline(always)]
+    fn cross_solid(
+        &mut self,
+        groups: &mut [RayGroup; GROUPS],
+        turn: &Turn,
+        asking: u64,
+        item: Item,
+    ) -> [u64; 2] {
+        let Self { view, kernel, rays, members, scratch, shades } = self;
+        if !shades.ending_on.is_empty() {
+            return [0, asking];
+        }
+        let solid = &view.solids[item.index()];
+        let told = shades.clear.len();
+        let mut met = 0;
+        let take = |place: usize, Crossing { t, part }: Crossing| {
+            let member = members[place];
+            let is_between = t > 0.0 && t < rays[usize::from(member)].reach;
+            let is_blocked =
+                is_between && shades.block(view, member, part.rank(solid), Face { item, part });
+            met |= u64::from(is_blocked) << place;
+            is_blocked
+        };
+        let (rays, asking) = ((&*groups, turn), (asking, true));
+        let in_doubt = cross_solid_together(*kernel, (view, item), rays, asking, scratch, take);
+        if in_doubt != 0 {
+            // What these were told of does not count.
+            let mut at = 0;
+            shades.clear.retain(|&(member, ..)| {
+                at += 1;
+                at <= told || !places(in_doubt).any(|place| members[place] == member)
+            });
+        }
+        [met, in_doubt]
     }
 
     #[inline(always)]

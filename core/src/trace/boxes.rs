@@ -12,10 +12,11 @@ use super::{
     },
     parallelepiped::PlaneCrossings,
     ray::{Ray, Shear},
+    solid_rays::{self, MOST_LEAVES, Met, Seen, SolidBeam, SolidRays},
 };
 use crate::prepared::{
     node::{Frame, Node},
-    record::BoxPlanes,
+    record::{BoxPlanes, LeafRecord, SolidRecord},
 };
 
 /// Tests a ray against a node's eight boxes: the distances at which it enters them, and which of
@@ -167,6 +168,76 @@ pub(super) trait BoxKernel: Copy {
     #[inline(always)]
     fn face_at(self, (ray, left_at): (&Ray, f64), planes: &BoxPlanes, t: f64, enters: bool) -> u32 {
         PlaneCrossings::new(ray, left_at, planes).face(t, enters)
+    }
+
+    /// Brings the rays of a group near a solid, as `Course::new` does with each; whether some ray
+    /// leaves a surface.
+    #[inline(always)]
+    fn approach(
+        self,
+        rays: &mut SolidRays,
+        group: (&RayGroup, &Turn),
+        solid: &SolidRecord,
+    ) -> bool {
+        solid_rays::approach(rays, group, solid)
+    }
+
+    /// The beam of rays near a solid, which go forward on these axes.
+    #[inline(always)]
+    fn surround_near(self, rays: &[SolidRays], is_forward: [bool; 3]) -> SolidBeam {
+        solid_rays::surround_near(rays, is_forward)
+    }
+
+    /// The boxes of a node that some ray may touch, a bit each.
+    #[inline(always)]
+    fn touch_beam(self, node: &Node, beam: &SolidBeam) -> u32 {
+        solid_rays::touch_beam(node, beam)
+    }
+
+    /// The groups `asking` of which some ray that asks touches the box between three near and three
+    /// far planes, a bit each.
+    #[inline(always)]
+    fn touch(self, rays: &[SolidRays], asking: (&[(usize, u8)], u8), planes: [[f32; 3]; 2]) -> u8 {
+        solid_rays::touch(rays, asking, planes)
+    }
+
+    /// Where rays enter and leave a sphere, as `Course::sure_stretch` finds it for those that are
+    /// inside it and not in doubt. `any_leaves` where some ray leaves some surface.
+    #[inline(always)]
+    fn meet_ball(
+        self,
+        rays: &SolidRays,
+        leaf: &LeafRecord,
+        (any_leaves, apart): (bool, f64),
+        ends: &mut [[f64; LANES]; 2],
+    ) -> Met {
+        solid_rays::meet_ball(rays, leaf, (any_leaves, apart), ends)
+    }
+
+    /// Where rays enter and leave a parallelepiped; as [`BoxKernel::cross_box`] finds it for those
+    /// that are inside it and not in doubt. `any_leaves` where some ray leaves some surface.
+    #[inline(always)]
+    fn meet_box(
+        self,
+        rays: &SolidRays,
+        planes: &BoxPlanes,
+        (any_leaves, apart): (bool, f64),
+        ends: &mut [[f64; LANES]; 2],
+    ) -> Met {
+        solid_rays::meet_box(rays, planes, (any_leaves, apart), ends)
+    }
+
+    /// Finds what rays are inside of just behind the places where they are `at`, and their `next`
+    /// ends.
+    #[inline(always)]
+    fn look(
+        self,
+        ends: &[[[f64; LANES]; 2]],
+        places: (&[f64; LANES], &[f64; LANES], f64),
+        inside: &mut [u8; MOST_LEAVES],
+        next: &mut [f64; LANES],
+    ) -> Seen {
+        solid_rays::look(ends, places, inside, next)
     }
 
     /// Takes the numbers that are `t` out of four, so that they become infinite: a bit for each.

@@ -16,10 +16,11 @@ use super::{
     gate::{Gate, Way},
     lanes::{Beam, Crossings, FACES, Focus, GROUPS, LANES, MOST_RAYS, RayGroup, Sieve, Turn},
     ray::{Ray, Shear},
+    solid_rays::{MOST_LEAVES, Met, Seen, SolidBeam, SolidRays},
 };
 use crate::prepared::{
     node::{Frame, Node},
-    record::BoxPlanes,
+    record::{BoxPlanes, LeafRecord, SolidRecord},
 };
 
 /// The kernel with AVX-512 (F and VL). [`Avx512Boxes::detect`] makes it on CPUs that have these,
@@ -58,6 +59,64 @@ impl BoxKernel for Avx512Boxes {
     #[inline(always)]
     fn face_at(self, rays: (&Ray, f64), planes: &BoxPlanes, t: f64, enters: bool) -> u32 {
         self.0.face_at(rays, planes, t, enters)
+    }
+
+    #[inline(always)]
+    fn approach(
+        self,
+        rays: &mut SolidRays,
+        group: (&RayGroup, &Turn),
+        solid: &SolidRecord,
+    ) -> bool {
+        self.0.approach(rays, group, solid)
+    }
+
+    #[inline(always)]
+    fn surround_near(self, rays: &[SolidRays], is_forward: [bool; 3]) -> SolidBeam {
+        self.0.surround_near(rays, is_forward)
+    }
+
+    #[inline(always)]
+    fn touch_beam(self, node: &Node, beam: &SolidBeam) -> u32 {
+        self.0.touch_beam(node, beam)
+    }
+
+    #[inline(always)]
+    fn touch(self, rays: &[SolidRays], asking: (&[(usize, u8)], u8), planes: [[f32; 3]; 2]) -> u8 {
+        self.0.touch(rays, asking, planes)
+    }
+
+    #[inline(always)]
+    fn meet_ball(
+        self,
+        rays: &SolidRays,
+        leaf: &LeafRecord,
+        (any_leaves, apart): (bool, f64),
+        ends: &mut [[f64; LANES]; 2],
+    ) -> Met {
+        self.0.meet_ball(rays, leaf, (any_leaves, apart), ends)
+    }
+
+    #[inline(always)]
+    fn meet_box(
+        self,
+        rays: &SolidRays,
+        planes: &BoxPlanes,
+        left: (bool, f64),
+        ends: &mut [[f64; LANES]; 2],
+    ) -> Met {
+        self.0.meet_box(rays, planes, left, ends)
+    }
+
+    #[inline(always)]
+    fn look(
+        self,
+        ends: &[[[f64; LANES]; 2]],
+        places: (&[f64; LANES], &[f64; LANES], f64),
+        inside: &mut [u8; MOST_LEAVES],
+        next: &mut [f64; LANES],
+    ) -> Seen {
+        self.0.look(ends, places, inside, next)
     }
 
     #[inline(always)]

@@ -28,12 +28,13 @@ use super::{
     },
     parallelepiped_x86,
     ray::{Ray, Shear},
+    solid_rays::{MOST_LEAVES, Met, Seen, SolidBeam, SolidRays},
 };
 use crate::{
     isa::Isa,
     prepared::{
         node::{Frame, Node},
-        record::BoxPlanes,
+        record::{BoxPlanes, LeafRecord, SolidRecord},
     },
 };
 
@@ -128,6 +129,83 @@ impl BoxKernel for Avx2Boxes {
     fn face_at(self, (ray, left_at): (&Ray, f64), planes: &BoxPlanes, t: f64, enters: bool) -> u32 {
         // SAFETY: a value of this type says that the CPU has AVX2.
         unsafe { parallelepiped_x86::face_at_with_avx2((ray, left_at), planes, t, enters) }
+    }
+
+    #[inline(always)]
+    fn approach(
+        self,
+        rays: &mut SolidRays,
+        group: (&RayGroup, &Turn),
+        solid: &SolidRecord,
+    ) -> bool {
+        // SAFETY: a value of this type says that the CPU has AVX2.
+        unsafe { parallelepiped_x86::approach_with_avx2(rays, group, solid) }
+    }
+
+    #[inline(always)]
+    fn surround_near(self, rays: &[SolidRays], is_forward: [bool; 3]) -> SolidBeam {
+        // SAFETY: a value of this type says that the CPU has AVX2.
+        unsafe { parallelepiped_x86::surround_near_with_avx2(rays, is_forward) }
+    }
+
+    #[inline(always)]
+    fn touch_beam(self, node: &Node, beam: &SolidBeam) -> u32 {
+        // SAFETY: a value of this type says that the CPU has AVX2.
+        unsafe { parallelepiped_x86::touch_beam_with_avx2(node, beam) }
+    }
+
+    #[inline(always)]
+    fn touch(self, rays: &[SolidRays], asking: (&[(usize, u8)], u8), planes: [[f32; 3]; 2]) -> u8 {
+        // SAFETY: a value of this type says that the CPU has AVX2.
+        unsafe { parallelepiped_x86::touch_with_avx2(rays, asking, planes) }
+    }
+
+    #[inline(always)]
+    fn meet_ball(
+        self,
+        rays: &SolidRays,
+        leaf: &LeafRecord,
+        (any_leaves, apart): (bool, f64),
+        ends: &mut [[f64; LANES]; 2],
+    ) -> Met {
+        // SAFETY: a value of this type says that the CPU has AVX2.
+        unsafe {
+            if any_leaves {
+                parallelepiped_x86::meet_ball_with_avx2::<true>(rays, leaf, apart, ends)
+            } else {
+                parallelepiped_x86::meet_ball_with_avx2::<false>(rays, leaf, apart, ends)
+            }
+        }
+    }
+
+    #[inline(always)]
+    fn meet_box(
+        self,
+        rays: &SolidRays,
+        planes: &BoxPlanes,
+        (any_leaves, apart): (bool, f64),
+        ends: &mut [[f64; LANES]; 2],
+    ) -> Met {
+        // SAFETY: a value of this type says that the CPU has AVX2.
+        unsafe {
+            if any_leaves {
+                parallelepiped_x86::meet_box_with_avx2::<true>(rays, planes, apart, ends)
+            } else {
+                parallelepiped_x86::meet_box_with_avx2::<false>(rays, planes, apart, ends)
+            }
+        }
+    }
+
+    #[inline(always)]
+    fn look(
+        self,
+        ends: &[[[f64; LANES]; 2]],
+        places: (&[f64; LANES], &[f64; LANES], f64),
+        inside: &mut [u8; MOST_LEAVES],
+        next: &mut [f64; LANES],
+    ) -> Seen {
+        // SAFETY: a value of this type says that the CPU has AVX2.
+        unsafe { parallelepiped_x86::look_with_avx2(ends, places, inside, next) }
     }
 
     #[inline(always)]

@@ -6,6 +6,7 @@ use super::{
     boxes::BoxKernel,
     quadrangle::toward_plane,
     ray::Ray,
+    solid_rays::STEEP,
     sphere::{hit_sphere, hit_sphere_again},
 };
 use crate::prepared::{
@@ -277,7 +278,3 @@ impl<'a> Course<'a> {
 
 /// The stretch inside a leaf that the ray passes by: it ends before all others begin.
 const NOWHERE: [f64; 2] = [f64::INFINITY, f64::NEG_INFINITY];
-
-/// The least cosine at which a leaf is met for sure: a crossing's doubt is then so small a part of
-/// the solid's margin that all together stay below half of it.
-const STEEP: f64 = 1.0 / (1 << 16) as f64;

@@ -6,6 +6,7 @@ use super::{
     box_ray::BoxRay,
     boxes::{BoxKernel, KernelWork},
     course::Crossing,
+    lanes::{GROUPS, RayGroup, Turn},
     quadrangle::{hit_chord, hit_plane, is_inside},
     ray::{Hit, Ray, Shear},
     solid::Scratch,
@@ -15,7 +16,7 @@ use super::{
 use crate::prepared::{
     face::{Face, Part},
     layout::View,
-    record::{Item, Kind, SolidRecord, Surface},
+    record::{Item, Kind, SolidNodeRecord, SolidRecord, Surface},
 };
 
 /// The search for the nearest face.
@@ -211,6 +212,57 @@ fn cross_solid<F: FnMut(Crossing) -> bool>(
     kernel.run(view, &mut work);
 }
 
+/// Rays of a packet in a solid, the crossings of which `take` is told of.
+struct CrossSolidTogether<'a, F> {
+    solid: &'a SolidRecord,
+    rays: (&'a [RayGroup; GROUPS], &'a Turn),
+    asking: (u64, bool),
+    scratch: &'a mut Scratch,
+    take: F,
+    in_doubt: u64,
+}
+
+impl<F: FnMut(usize, Crossing) -> bool> KernelWork<View<'_>> for CrossSolidTogether<'_, F> {
+    #[inline(always)]
+    fn run(&mut self, view: &View<'_>, kernel: impl BoxKernel) {
+        let Self { solid, rays, asking, scratch, take, in_doubt } = self;
+        *in_doubt = scratch.lanes().cross((view, solid), kernel, *rays, *asking, take);
+    }
+}
+
+/// Crosses a solid with the rays `asking` of a packet, where none ends on a light, as
+/// `SolidLanes::cross` has it; the rays in doubt.
+#[inline(never)]
+pub(super) fn cross_solid_together<F: FnMut(usize, Crossing) -> bool>(
+    kernel: impl BoxKernel,
+    (view, item): (&View<'_>, Item),
+    rays: (&[RayGroup; GROUPS], &Turn),
+    asking: (u64, bool),
+    scratch: &mut Scratch,
+    take: F,
+) -> u64 {
+    let solid = &view.solids[item.index()];
+    if solid_is_large(view, solid) {
+        return asking.0;
+    }
+    let mut work = CrossSolidTogether { solid, rays, asking, scratch, take, in_doubt: 0 };
+    kernel.run(view, &mut work);
+    work.in_doubt
+}
+
+fn solid_is_large(view: &View<'_>, solid: &SolidRecord) -> bool {
+    view.solid_nodes(solid).len() > SolidNodeRecord::BITS
+}
+
+/// Whether a ray meets a solid in a crossing.
+#[inline(always)]
+pub(super) fn counts(view: &View<'_>, solid: &SolidRecord, ray: &Ray, crossing: Crossing) -> bool {
+    let Crossing { t, part } = crossing;
+    t > 0.0
+        || (part.rank(solid) > ray.after
+            && part.leaf_of(view, solid).surface(part.face()) == ray.leaving)
+}
+
 /// What [`meet`] tells, for a solid, up to `reach`.
 #[inline(always)]
 fn meet_solid(
@@ -223,11 +275,10 @@ fn meet_solid(
 ) -> Option<(f64, u32, Part)> {
     let solid = &view.solids[index];
     let mut met = None;
-    let take = |Crossing { t, part }| {
-        let rank = part.rank(solid);
-        let is_met = t > 0.0
-            || (rank > ray.after && part.leaf_of(view, solid).surface(part.face()) == ray.leaving);
-        met = is_met.then_some((t, rank, part));
+    let take = |crossing: Crossing| {
+        let is_met = counts(view, solid, ray, crossing);
+        let Crossing { t, part } = crossing;
+        met = is_met.then_some((t, part.rank(solid), part));
         is_met
     };
     let work = CrossSolid { solid, ray, box_ray, ending_on: &[], reach, scratch, take };

@@ -207,6 +207,29 @@ pub(super) struct Crossings {
     pub(super) within: u64,
 }
 
+/// The bits of a mask.
+#[inline(always)]
+pub(super) fn places(mut mask: u64) -> impl Iterator<Item = usize> {
+    std::iter::from_fn(move || {
+        let place = mask.trailing_zeros() as usize;
+        (mask != 0).then(|| {
+            mask &= mask - 1;
+            place % MOST_RAYS
+        })
+    })
+}
+
+/// The groups in which a mask has rays, each with its part of the mask.
+#[inline(always)]
+pub(super) fn groups(mut mask: u64) -> impl Iterator<Item = (usize, u64)> {
+    std::iter::from_fn(move || {
+        let k = mask.trailing_zeros() as usize / LANES % GROUPS;
+        let asking = mask >> (LANES * k) & 0xFF;
+        mask &= !(0xFF << (LANES * k));
+        (asking != 0).then_some((k, asking))
+    })
+}
+
 /// The smaller number as the SIMD instructions have it: of a NaN and a number, the second operand.
 #[inline(always)]
 pub(super) fn smaller(a: f32, b: f32) -> f32 {

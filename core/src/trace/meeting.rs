@@ -2,7 +2,7 @@
 
 use super::{
     box_ray::BoxRay,
-    lanes::{LANES, RayGroup},
+    lanes::{GROUPS, LANES, RayGroup, Turn},
     ray::Shear,
     traversal::Step,
 };
@@ -46,6 +46,17 @@ pub(super) trait Meeting {
 
     /// The ray's line crosses a quadrangle that the ray does not leave, at a distance above 0.
     fn cross_quadrangle(&mut self, place: usize, item: Item, t: f64) -> Step;
+
+    /// The rays `asking` of a packet may meet a solid: which of them have met something that
+    /// counts, and which are in doubt and ask alone. Where rays reach less far then, their groups
+    /// know.
+    fn cross_solid(
+        &mut self,
+        groups: &mut [RayGroup; GROUPS],
+        turn: &Turn,
+        asking: u64,
+        item: Item,
+    ) -> [u64; 2];
 
     /// The ray may meet an item.
     fn ask(&mut self, place: usize, item: Item, shear: &Shear, box_ray: &BoxRay) -> Step;

@@ -26,6 +26,8 @@ pub(crate) mod probe;
 pub(crate) mod quadrangle;
 pub(crate) mod ray;
 pub(crate) mod solid;
+mod solid_lanes;
+mod solid_rays;
 pub(crate) mod sphere;
 pub(crate) mod timed;
 pub(crate) mod traversal;

@@ -14,7 +14,9 @@ use super::{
     boxes::BoxKernel,
     gate::{Gate, Way},
     lane_faces::{cross_plane, cross_sphere, cross_sphere_again, leaves, pass_quadrangle},
-    lanes::{Beam, Focus, GROUPS, LANES, MOST_RAYS, RayGroup, Turn, larger, shear_at},
+    lanes::{
+        Beam, Focus, GROUPS, LANES, MOST_RAYS, RayGroup, Turn, groups, larger, places, shear_at,
+    },
     lone::step,
     meeting::Meeting,
     ray::{Ray, Shear},
@@ -31,6 +33,9 @@ const FEW: u32 = 2;
 
 /// So many rays, or fewer, are not sifted before they are tried on a triangle.
 const FEW_TO_SIFT: u32 = 8;
+
+/// Fewer rays of a group than this meet a solid each alone.
+const FEWEST_IN_SOLID: u32 = 4;
 
 /// Lines that pass by a point by no more than this part of the frame have it as a focus.
 const MOST_SPREAD: f64 = 1.0 / (1_u64 << 20) as f64;
@@ -228,12 +233,14 @@ impl Packet {
                     is_changed |= self.meet_quadrangle(view, (item, mask), meeting);
                     continue;
                 }
-                kind => {
+                Some(Kind::Solid) => {
+                    is_changed |= self.meet_solid((item, mask), meeting);
+                    continue;
+                }
+                _ => {
                     for place in places(mask) {
                         let shear = self.shear(place);
-                        let is_solid = kind == Some(Kind::Solid);
-                        let box_ray = if is_solid { self.box_ray(place) } else { BoxRay::NOWHERE };
-                        let step = meeting.ask(place, item, &shear, &box_ray);
+                        let step = meeting.ask(place, item, &shear, &BoxRay::NOWHERE);
                         is_changed |= self.take(place, &step);
                     }
                     continue;
@@ -380,6 +387,35 @@ impl Packet {
         is_changed
     }
 
+    /// The rays of a mask meet a solid; whether one has ended or reaches less far than before.
+    #[inline(always)]
+    fn meet_solid<M: Meeting>(&mut self, (item, mask): (Item, u64), meeting: &mut M) -> bool {
+        let mut together = 0;
+        for (k, asking) in groups(mask) {
+            if asking.count_ones() >= FEWEST_IN_SOLID {
+                together |= asking << (LANES * k);
+            }
+        }
+        let [mut counts, mut in_doubt] = [0; 2];
+        if together != 0 {
+            [counts, in_doubt] = meeting.cross_solid(&mut self.groups, &self.turn, together, item);
+        }
+        if M::ENDS {
+            self.alive &= !counts;
+        } else {
+            for (k, _) in groups(counts) {
+                self.shortened |= 1 << k;
+            }
+        }
+        let mut is_changed = counts != 0;
+        for place in places(mask & !together | in_doubt) {
+            let (shear, box_ray) = (self.shear(place), self.box_ray(place));
+            let step = meeting.ask(place, item, &shear, &box_ray);
+            is_changed |= self.take(place, &step);
+        }
+        is_changed
+    }
+
     /// A ray goes on alone in a child.
     #[inline(always)]
     fn visit_alone(
@@ -424,29 +460,6 @@ fn start_together(groups: &[RayGroup]) -> bool {
         }
     }
     true
-}
-
-/// The bits of a mask.
-#[inline(always)]
-pub(super) fn places(mut mask: u64) -> impl Iterator<Item = usize> {
-    std::iter::from_fn(move || {
-        let place = mask.trailing_zeros() as usize;
-        (mask != 0).then(|| {
-            mask &= mask - 1;
-            place % MOST_RAYS
-        })
-    })
-}
-
-/// The groups in which a mask has rays, each with its part of the mask.
-#[inline(always)]
-fn groups(mut mask: u64) -> impl Iterator<Item = (usize, u64)> {
-    std::iter::from_fn(move || {
-        let k = mask.trailing_zeros() as usize / LANES % GROUPS;
-        let asking = mask >> (LANES * k) & 0xFF;
-        mask &= !(0xFF << (LANES * k));
-        (asking != 0).then_some((k, asking))
-    })
 }
 
 /// The lanes of a group's part of a mask.

@@ -14,6 +14,7 @@ use super::{
     boxes::BoxKernel,
     course::{Course, Crossing, End, Pin},
     ray::Ray,
+    solid_lanes::SolidLanes,
     walk::{Walk, Walked},
 };
 use crate::prepared::{
@@ -52,9 +53,15 @@ pub(super) struct Scratch {
     /// How much of the ray was in doubt, all in all.
     doubted: f64,
     walk: Walk,
+    lanes: SolidLanes,
 }
 
 impl Scratch {
+    /// Room for the rays of a group.
+    pub(super) fn lanes(&mut self) -> &mut SolidLanes {
+        &mut self.lanes
+    }
+
     /// Calls `take` for the crossings of the solid's surface from the ray's start up to `reach`, in
     /// order, until it says that it has enough. A surface that the ray leaves is crossed at 0, and
     /// one that it ends on (`ending_on`) at the ray's own reach.
@@ -497,9 +504,14 @@ mod tests {
     use crate::{
         isa::Isa,
         prepare::prepare,
-        prepared::{PreparedBytes, PreparedScene},
+        prepared::{PreparedBytes, PreparedScene, face::Part},
         scene::{Material, Operation, Parallelepiped, Scene, Solid, SolidNode, Sphere, Viewport},
-        trace::{boxes::KernelWork, kernels::run_with_kernel},
+        trace::{
+            boxes::KernelWork,
+            kernels::run_with_kernel,
+            lanes::{CLASSES, GROUPS, LANES, RayGroup, Turn, class_of},
+            solid_rays::{MOST_LEAVES, SolidRays},
+        },
     };
 
     /// The plain evaluation of every leaf and every node, whatever the ray touches.
@@ -630,6 +642,11 @@ mod tests {
 
     /// A scene of this solid alone.
     fn opened(solid: Solid) -> PreparedScene<PreparedBytes> {
+        opened_with(solid, Vec::new())
+    }
+
+    /// A scene of this solid and some spheres.
+    fn opened_with(solid: Solid, spheres: Vec<Sphere>) -> PreparedScene<PreparedBytes> {
         let viewport = Viewport {
             eye: DVec3::Z * 5.0,
             top_left: DVec3::new(-1.0, 1.0, 0.0),
@@ -648,6 +665,7 @@ mod tests {
             viewport: Some(viewport),
             materials: vec![material],
             solids: vec![solid],
+            spheres,
             ..Scene::default()
         };
         PreparedScene::open(prepare(&scene).unwrap()).unwrap()
@@ -820,6 +838,197 @@ mod tests {
         }
         eprintln!("{crossed} crossings of large solids");
         assert!(crossed > 10_000);
+    }
+
+    /// What rays of a group are told of, with the kernel of an instruction set.
+    struct ToldTogether<'a> {
+        solid: &'a SolidRecord,
+        lanes: &'a mut SolidLanes,
+        rays: &'a [Ray],
+        skips_start: bool,
+        most: usize,
+        found: Vec<Vec<(u64, Part)>>,
+        in_doubt: u64,
+    }
+
+    impl KernelWork<View<'_>> for ToldTogether<'_> {
+        fn run(&mut self, view: &View<'_>, kernel: impl BoxKernel) {
+            let Self { solid, rays, most, found, .. } = self;
+            let turn = Turn::new(&rays[0], &view.header.frame);
+            let of_lanes = std::array::from_fn(|lane| &rays[lane.min(rays.len() - 1)]);
+            let mut groups = [RayGroup::EMPTY; GROUPS];
+            kernel.fill(&mut groups[0], of_lanes, &turn);
+            let asking = (u64::MAX >> (64 - rays.len()), self.skips_start);
+            let take = |lane: usize, Crossing { t, part }| {
+                found[lane].push((t.to_bits(), part));
+                found[lane].len() == *most
+            };
+            self.in_doubt = self.lanes.cross((view, solid), kernel, (&groups, &turn), asking, take);
+        }
+    }
+
+    /// All that a kernel finds of a group's rays at a solid.
+    impl KernelWork<View<'_>> for (&[Ray], Vec<String>) {
+        fn run(&mut self, view: &View<'_>, kernel: impl BoxKernel) {
+            let (rays, found) = self;
+            let solid = &view.solids[0];
+            let turn = Turn::new(&rays[0], &view.header.frame);
+            let mut group = RayGroup::EMPTY;
+            let of_lanes = std::array::from_fn(|lane| &rays[lane.min(rays.len() - 1)]);
+            kernel.fill(&mut group, of_lanes, &turn);
+            let mut near = [SolidRays::EMPTY];
+            let any_leaves = kernel.approach(&mut near[0], (&group, &turn), solid);
+            let beam = kernel.surround_near(&near, turn.is_forward);
+            found.push(format!("{near:?} {any_leaves} {beam:?}"));
+            for node in view.solid_boxes {
+                found.push(format!("{:b}", kernel.touch_beam(node, &beam)));
+                for child in 0..8 {
+                    let planes = |sides: [usize; 3]| sides.map(|side| node.planes[side][child]);
+                    let planes = [planes(beam.beam.near), planes(beam.beam.far)];
+                    found.push(format!("{}", kernel.touch(&near, (&[(0, u8::MAX)], 1), planes)));
+                }
+            }
+            let mut all_ends = Vec::new();
+            let apart = solid.margin / 1024.0;
+            for leaf in view.solid_leaves(solid).iter().take(MOST_LEAVES) {
+                let mut ends = [[0.0; LANES]; 2];
+                let met = if leaf.is_sphere() {
+                    kernel.meet_ball(&near[0], leaf, (any_leaves, apart), &mut ends)
+                } else {
+                    let planes = &view.box_planes[leaf.surface as usize];
+                    kernel.meet_box(&near[0], planes, (any_leaves, apart), &mut ends)
+                };
+                found.push(format!("{met:?}"));
+                all_ends.push(ends);
+            }
+            let (mut at, mut next) = (near[0].left_at, [0.0; LANES]);
+            for _ in 0..3 {
+                let mut inside = [0; MOST_LEAVES];
+                let places = (&at, &near[0].near.reach, apart);
+                let seen = kernel.look(&all_ends, places, &mut inside, &mut next);
+                found.push(format!("{seen:?} {inside:?} {next:?}"));
+                at = next;
+            }
+            found.push(format!("{all_ends:?}"));
+        }
+    }
+
+    /// Rays of a class, which are told of what each is told of by the plain evaluation, if they are
+    /// not in doubt: how many crossings they were told of, and how many are in doubt.
+    fn check_group(
+        view: &View<'_>,
+        lanes: &mut SolidLanes,
+        (rays, skips_start): (&[Ray], bool),
+        what: &str,
+    ) -> [usize; 2] {
+        let solid = &view.solids[0];
+        let counts = |crossing: &Crossing| !skips_start || crossing.t > 0.0;
+        let truths: Vec<Vec<_>> = rays
+            .iter()
+            .map(|ray| {
+                let truth = plain_crossings(&Course::new(view, solid, ray, &[]), ray.reach);
+                truth.into_iter().filter(counts).map(|it| (it.t.to_bits(), it.part)).collect()
+            })
+            .collect();
+        let mut told = 0;
+        let mut in_doubt = 0;
+        for most in [1, 2, usize::MAX] {
+            let mut first = None;
+            for isa in Isa::ALL.into_iter().filter(|isa| isa.is_supported()) {
+                let lanes = &mut *lanes;
+                let found = vec![Vec::new(); rays.len()];
+                let mut work =
+                    ToldTogether { solid, lanes, rays, skips_start, most, found, in_doubt: 0 };
+                run_with_kernel(isa, view, &mut work);
+                for (lane, (found, truth)) in work.found.iter().zip(&truths).enumerate() {
+                    let truth = &truth[..most.min(truth.len())];
+                    let is_in_doubt = work.in_doubt >> lane & 1 == 1;
+                    assert!(
+                        is_in_doubt || found == truth,
+                        "{what}, {isa}: {:?}: {found:?}, {truth:?}",
+                        rays[lane]
+                    );
+                }
+                told += work.found.iter().map(Vec::len).sum::<usize>();
+                in_doubt += work.in_doubt.count_ones() as usize;
+                let this = (work.found, work.in_doubt);
+                assert_eq!(first.get_or_insert(this.clone()), &this, "{what}, {isa}");
+            }
+        }
+        [told, in_doubt]
+    }
+
+    #[test]
+    fn rays_of_a_group_are_told_what_each_is_told_alone() {
+        let [mut told, mut in_doubt, mut groups] = [0; 3];
+        let mut lanes = SolidLanes::default();
+        for seed in 0..few_rays(6_000) as u64 {
+            let random = &mut random(seed);
+            let style = STYLES[seed as usize % 4];
+            let most_leaves = if seed % 8 == 0 { 40.0 } else { 9.0 };
+            let leaf_count = random.log_uniform(2.0, most_leaves) as u32;
+            let solid = random_solid(random, style, leaf_count, seed % 5 == 0);
+            // Some solids are small in their scene: rays come from far off.
+            let (place, _) = random_ray(random, &solid, style);
+            let center = place + 100.0 * random.direction();
+            let far = Sphere { center, radius: 1.0, material: 0, primitive: 99 };
+            let spheres = if random.chance(0.3) { vec![far] } else { Vec::new() };
+            let prepared = opened_with(solid.clone(), spheres);
+            let view = prepared.view();
+            let record = &view.solids[0];
+            if view.solid_nodes(record).len() > SolidNodeRecord::BITS {
+                continue;
+            }
+            let mut classes = vec![Vec::new(); CLASSES];
+            let mut class = |ray: Ray| {
+                let class = class_of(&ray, &view.header.frame) as usize;
+                if let Some(rays) = classes.get_mut(class) {
+                    rays.push(ray);
+                }
+            };
+            for _ in 0..40 {
+                let (origin, direction) = random_ray(random, &solid, style);
+                let ray = Ray {
+                    origin: origin * view.header.scale,
+                    direction,
+                    reach: f64::INFINITY,
+                    leaving: Surface::NONE,
+                    after: Ray::NOTHING_AHEAD,
+                };
+                class(ray);
+                let truth = plain_crossings(&Course::new(&view, record, &ray, &[]), f64::INFINITY);
+                let Some(&Crossing { t, part }) = truth.get(random.below(truth.len().max(1)))
+                else {
+                    continue;
+                };
+                class(Ray { reach: t.max(f64::MIN_POSITIVE), ..ray });
+                let leaving = part.leaf_of(&view, record).surface(part.face());
+                let origin = ray.origin + t * ray.direction;
+                let along = random_ray(random, &solid, style).1;
+                for direction in [direction, random.direction(), along] {
+                    class(Ray { origin, direction, leaving, ..ray });
+                }
+            }
+            for (k, rays) in classes.iter().flat_map(|rays| rays.chunks(LANES)).enumerate() {
+                let what = format!("{style:?} solid {seed}");
+                let found = check_group(&view, &mut lanes, (rays, k % 2 == 0), &what);
+                told += found[0];
+                in_doubt += found[1];
+                if groups % 16 == 0 {
+                    let isas = Isa::ALL.into_iter().filter(|isa| isa.is_supported());
+                    let found = isas.map(|isa| {
+                        let mut found = (rays, Vec::new());
+                        run_with_kernel(isa, &view, &mut found);
+                        found.1
+                    });
+                    let found: Vec<Vec<String>> = found.collect();
+                    assert!(found.iter().all(|it| *it == found[0]), "{what}: {found:#?}");
+                }
+                groups += 1;
+            }
+        }
+        eprintln!("{groups} groups, {told} told, {in_doubt} in doubt");
+        assert!(told > 100_000 && in_doubt > 1_000 && in_doubt < told, "{told}, {in_doubt}");
     }
 
     #[test]
