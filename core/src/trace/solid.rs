@@ -53,13 +53,14 @@ pub(super) struct Scratch {
     /// How much of the ray was in doubt, all in all.
     doubted: f64,
     walk: Walk,
-    lanes: SolidLanes,
+    /// Made when first a group comes to a solid.
+    lanes: Option<Box<SolidLanes>>,
 }
 
 impl Scratch {
     /// Room for the rays of a group.
     pub(super) fn lanes(&mut self) -> &mut SolidLanes {
-        &mut self.lanes
+        self.lanes.get_or_insert_default()
     }
 
     /// Calls `take` for the crossings of the solid's surface from the ray's start up to `reach`, in
