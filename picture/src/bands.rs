@@ -338,7 +338,7 @@ mod tests {
     fn any_order_of_tiles_and_any_number_of_threads_give_the_same_file() {
         for format in FORMATS {
             let expected = expected(format);
-            for (seed, threads) in [(1, 1), (2, 2), (3, 5)] {
+            for (seed, threads) in [(1, 1), (2, 5)] {
                 let folder = tempfile::tempdir().unwrap();
                 let picture = picture_of(format).packed_early(folder.path());
                 let mut rng = fastrand::Rng::with_seed(seed);

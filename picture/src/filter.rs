@@ -2,33 +2,36 @@
 //!
 //! Source: "Portable Network Graphics (PNG) Specification" (W3C, third edition, 2025), section 9.
 
-/// Writes a row's filter and the row filtered by it behind `filtered`. Of the filters the one is
-/// chosen that gives the least sum of absolute differences (section 12.7 of the specification).
-/// `row` and the row above, `above`, have equally many bytes, and at least one pixel of
-/// `pixel_bytes` bytes; above the first row stand zeros. `spare` keeps its memory from row to row.
-pub(crate) fn filter_row(
-    above: &[u8],
-    row: &[u8],
-    pixel_bytes: usize,
-    filtered: &mut Vec<u8>,
-    spare: &mut Vec<u8>,
-) {
-    let mut least = u64::MAX;
-    let at = filtered.len();
-    filtered.resize(at + 1 + row.len(), 0);
-    spare.resize(row.len(), 0);
-    // Equal sums: the first. A flat row has the sum 0 at once.
-    for (number, filter) in [(2, up as Filter), (1, sub), (3, average), (4, paeth)] {
-        filter(above, row, pixel_bytes, spare);
-        let sum = spare.chunks(256).map(sum_of_differences).sum();
-        if sum < least {
-            least = sum;
-            filtered[at] = number;
-            filtered[at + 1..].copy_from_slice(spare);
-            if sum == 0 {
-                return;
+/// Filters rows, one after the other, and keeps its memory from row to row.
+#[derive(Debug, Default)]
+pub(crate) struct RowFilter {
+    best: Vec<u8>,
+    other: Vec<u8>,
+}
+
+impl RowFilter {
+    /// A filter's number and the row filtered by it. Of the filters the one is chosen that gives
+    /// the least sum of absolute differences (section 12.7 of the specification). `row` and the
+    /// row above, `above`, have equally many bytes, and at least one pixel of `pixel_bytes` bytes;
+    /// above the first row stand zeros.
+    pub(crate) fn filter(&mut self, above: &[u8], row: &[u8], pixel_bytes: usize) -> &[u8] {
+        let mut least = u64::MAX;
+        self.best.resize(1 + row.len(), 0);
+        self.other.resize(1 + row.len(), 0);
+        // Equal sums: the first. A flat row has the sum 0 at once.
+        for (number, filter) in [(2, up as Filter), (1, sub), (3, average), (4, paeth)] {
+            self.other[0] = number;
+            filter(above, row, pixel_bytes, &mut self.other[1..]);
+            let sum = self.other[1..].chunks(256).map(sum_of_differences).sum();
+            if sum < least {
+                least = sum;
+                std::mem::swap(&mut self.best, &mut self.other);
+                if sum == 0 {
+                    break;
+                }
             }
         }
+        &self.best
     }
 }
 
@@ -144,7 +147,7 @@ mod tests {
     #[test]
     fn a_filtered_row_is_found_again() {
         let mut rng = fastrand::Rng::with_seed(1);
-        let mut chosen = [0; 5];
+        let (mut chosen, mut filter) = ([0; 5], RowFilter::default());
         for pixel_bytes in [3, 6] {
             for width in [1, 2, 7, 40] {
                 for slope in 0..8 {
@@ -154,10 +157,9 @@ mod tests {
                         (0..width * pixel_bytes).map(|i| byte(i) ^ rng.u8(..noise)).collect()
                     };
                     let (above, row) = (row(3), row(5));
-                    let mut filtered = vec![9];
-                    filter_row(&above, &row, pixel_bytes, &mut filtered, &mut Vec::new());
-                    assert_eq!(unfilter(&above, &filtered[1..], pixel_bytes), row);
-                    chosen[usize::from(filtered[1])] += 1;
+                    let filtered = filter.filter(&above, &row, pixel_bytes);
+                    assert_eq!(unfilter(&above, filtered, pixel_bytes), row);
+                    chosen[usize::from(filtered[0])] += 1;
                 }
             }
         }

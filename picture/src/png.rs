@@ -5,10 +5,11 @@ use std::{
     ops::Range,
 };
 
+use fdeflate::Compressor;
 use png::{BitDepth, ColorType, Encoder, SrgbRenderingIntent, chunk::IDAT};
 use rtfarm_core::transfer::Transfer;
 
-use crate::{Notes, Picture, filter::filter_row, pixels::Pixels};
+use crate::{Notes, Picture, filter::RowFilter, pixels::Pixels};
 
 /// A zlib stream whose blocks are the bands': deflate with a window of 32 KiB, made in haste.
 const ZLIB_HEADER: [u8; 2] = [0x78, 0x01];
@@ -67,20 +68,23 @@ pub(crate) fn encode(
 /// A band's blocks of deflate, none of which is the last one and which refer to nothing before
 /// them, up to a byte's end; then the Adler-32 of what is in them.
 pub(crate) fn pack(pixels: &Pixels, rows: Range<u32>) -> io::Result<Vec<u8>> {
-    let row_bytes = pixels.row_bytes();
-    // Above the first row of the picture stand zeros.
-    let has_above = rows.start > 0;
-    let first = rows.start - u32::from(has_above);
-    let mut bytes = vec![0; row_bytes * usize::from(!has_above)];
-    pixels.read_rows(first..rows.end, &mut bytes)?;
-    let pixel_bytes = pixels.format().bytes_per_pixel();
-    let mut filtered = Vec::with_capacity(rows.len() * (1 + row_bytes));
-    let mut spare = Vec::new();
-    let rows = || bytes.chunks_exact(row_bytes);
-    for (above, row) in rows().zip(rows().skip(1)) {
-        filter_row(above, row, pixel_bytes, &mut filtered, &mut spare);
+    let (row_bytes, pixel_bytes) = (pixels.row_bytes(), pixels.format().bytes_per_pixel());
+    let (mut above, mut row) = (Vec::new(), Vec::new());
+    if rows.start == 0 {
+        // Above the first row of the picture stand zeros.
+        above.resize(row_bytes, 0);
+    } else {
+        pixels.read_rows(rows.start - 1..rows.start, &mut above)?;
     }
-    open_end(fdeflate::compress_to_vec(&filtered))
+    let mut filter = RowFilter::default();
+    let mut compressor = Compressor::new(Vec::with_capacity(rows.len() * row_bytes / 4))?;
+    for y in rows {
+        row.clear();
+        pixels.read_rows(y..y + 1, &mut row)?;
+        compressor.write_data(filter.filter(&above, &row, pixel_bytes))?;
+        std::mem::swap(&mut above, &mut row);
+    }
+    open_end(compressor.finish()?)
         .ok_or_else(|| io::Error::other("the deflated band is not as fdeflate writes it"))
 }
 
