@@ -20,6 +20,9 @@ const EMPTY_BLOCK: [u8; 2] = [0x03, 0x00];
 /// A checksum's bytes.
 const ADLER_BYTES: usize = 4;
 
+/// Filtered bytes that are compressed at once, about.
+const AT_ONCE: usize = 1 << 16;
+
 /// Rows of a band: about 1 MiB, so that what a band costs of its own, 70 bytes, is little even
 /// where the picture is flat. They depend on nothing but what a row takes.
 pub(crate) fn band_rows(row_bytes: usize) -> u32 {
@@ -78,12 +81,20 @@ pub(crate) fn pack(pixels: &Pixels, rows: Range<u32>) -> io::Result<Vec<u8>> {
     }
     let mut filter = RowFilter::default();
     let mut compressor = Compressor::new(Vec::with_capacity(rows.len() * row_bytes / 4))?;
+    let byte_count = rows.len() * (1 + row_bytes);
+    let mut waiting = Vec::with_capacity(byte_count.min(AT_ONCE + row_bytes));
     for y in rows {
         row.clear();
         pixels.read_rows(y..y + 1, &mut row)?;
-        compressor.write_data(filter.filter(&above, &row, pixel_bytes))?;
+        waiting.extend_from_slice(filter.filter(&above, &row, pixel_bytes));
+        // A run of zeros ends with what is compressed at once.
+        if waiting.len() >= AT_ONCE {
+            compressor.write_data(&waiting)?;
+            waiting.clear();
+        }
         std::mem::swap(&mut above, &mut row);
     }
+    compressor.write_data(&waiting)?;
     open_end(compressor.finish()?)
         .ok_or_else(|| io::Error::other("the deflated band is not as fdeflate writes it"))
 }
