@@ -5,7 +5,7 @@ use std::{fs::File, io, os::unix::fs::FileExt, path::Path, sync::Mutex};
 
 use rtfarm_core::{
     render::Tally,
-    tile::{TileGrid, TileId},
+    tile::{Area, TileGrid, TileId},
     transfer::Transfer,
 };
 
@@ -85,6 +85,7 @@ impl Canvas {
         transfer: Transfer,
     ) -> io::Result<Self> {
         let picture = Picture::new_in(folder, grid.window(), format, transfer)?;
+        let picture = picture.packed_early(folder);
         let tallies = vec![Tally::default(); grid.count() as usize].into();
         Ok(Self { picture, grid, tallies, records: None })
     }
@@ -107,6 +108,7 @@ impl Canvas {
         };
         let file = create(PICTURE, Picture::byte_count(grid.window().size(), format))?;
         let picture = Picture::with(file, grid.window(), format, transfer, disk.clone());
+        let picture = picture.packed_early(beside(folder));
         let file = create(RECORDS, record_offset(grid.count()))?;
         let key = blake3::derive_key(CONTEXT, subject);
         let records = Some(Records { file, key, disk: disk.clone() });
@@ -133,6 +135,7 @@ impl Canvas {
         };
         let file = open(PICTURE, Picture::byte_count(grid.window().size(), format))?;
         let picture = Picture::with(file, grid.window(), format, transfer, disk.clone());
+        let picture = picture.packed_early(beside(folder));
         let file = open(RECORDS, record_offset(grid.count()))?;
         let key = blake3::derive_key(CONTEXT, subject);
         let records = Some(Records { file, key, disk: disk.clone() });
@@ -147,8 +150,11 @@ impl Canvas {
     /// The tiles in a picture that outlives its process. What does not match its record is not in
     /// it.
     pub fn done(&self) -> io::Result<Vec<(TileId, TileRecord)>> {
-        let records = self.records.as_ref();
-        records.map_or_else(|| Ok(Vec::new()), |records| records.read(self.grid, &self.picture))
+        let Some(records) = &self.records else { return Ok(Vec::new()) };
+        let done = records.read(self.grid, &self.picture)?;
+        let areas: Vec<Area> = done.iter().map(|&(tile, _)| self.grid.area(tile)).collect();
+        self.picture.find(&areas)?;
+        Ok(done)
     }
 
     /// What the tiles took that are in the picture. They are summed by their numbers: floats that
@@ -225,12 +231,7 @@ impl Canvas {
                 tallies[tile.index()] = Tally::default();
             }
         }
-        let areas = tiles.iter().map(|&tile| self.grid.area(tile));
-        for area in areas {
-            let black = vec![[0.0; 3]; area.pixel_count()];
-            self.picture.put(area, &black)?;
-        }
-        Ok(())
+        tiles.iter().try_for_each(|&tile| self.picture.clear(self.grid.area(tile)))
     }
 
     /// Makes what was put so far outlive a power cut.
@@ -274,6 +275,12 @@ impl Records {
         }
         Ok(done)
     }
+}
+
+/// Where a picture's compressed bands wait: its own folder may get another name meanwhile, and is
+/// to hold nothing else.
+fn beside(folder: &Path) -> &Path {
+    folder.parent().filter(|parent| !parent.as_os_str().is_empty()).unwrap_or(Path::new("."))
 }
 
 fn record_offset(number: u32) -> u64 {

@@ -2,11 +2,14 @@
 //! as a PNG or an `OpenEXR`, band by band, so that its size is not limited by memory. A [`Canvas`]
 //! may outlive its process, and says then which tiles are in it. A [`View`] shows one under way.
 
+mod bands;
 mod canvas;
 mod disk;
 mod exr;
+mod filter;
 mod format;
 mod picture;
+mod pixels;
 mod png;
 mod reading;
 mod view;

@@ -9,6 +9,7 @@ use std::{
 };
 
 use ::png::BitDepth;
+use rayon::prelude::*;
 use rtfarm_core::{
     tile::{Area, Size},
     transfer::Transfer,
@@ -18,7 +19,13 @@ use rustix::{
     io::Errno,
 };
 
-use crate::{Disk, PictureFormat, exr, png};
+use crate::{
+    Disk, PictureFormat,
+    bands::{Bands, Change},
+    exr,
+    pixels::Pixels,
+    png,
+};
 
 /// Why a tile cannot be put into a picture.
 #[derive(Debug, thiserror::Error)]
@@ -66,15 +73,19 @@ pub struct TilePixels<'a> {
 /// Bytes of a pixel in [`TilePixels`].
 pub(crate) const PIXEL_BYTES: usize = 12;
 
+/// Bytes of rows that are compressed at once when a picture is encoded, and as how many bands at
+/// least and at most.
+const BYTES_AT_ONCE: usize = 8 << 20;
+const BANDS_AT_ONCE: (usize, usize) = (8, 64);
+
 /// A picture in a file, row by row from the top left. Tiles may be put from several threads; the
 /// picture itself takes no memory.
 #[derive(Debug)]
 pub struct Picture {
-    file: File,
-    window: Area,
-    format: PictureFormat,
-    transfer: Transfer,
+    pixels: Pixels,
     disk: Disk,
+    /// Its bands, where they are compressed while tiles come in.
+    bands: Option<Bands>,
 }
 
 impl Picture {
@@ -99,7 +110,13 @@ impl Picture {
         transfer: Transfer,
         disk: Disk,
     ) -> Self {
-        Self { file, window, format, transfer, disk }
+        Self { pixels: Pixels::new(file, window, format, transfer), disk, bands: None }
+    }
+
+    /// The same black picture, whose bands are compressed as soon as all their pixels have come,
+    /// and kept in a file of `folder` that has no name. Nothing of it shows but when it is encoded.
+    pub(crate) fn packed_early(self, folder: &Path) -> Self {
+        Self { bands: Bands::new(&self.pixels, folder), ..self }
     }
 
     /// Makes a black picture in a file of `folder` that has no name, so that nothing stays behind
@@ -123,17 +140,27 @@ impl Picture {
 
     /// The picture's size in pixels.
     pub fn size(&self) -> Size {
-        self.window.size()
+        self.pixels.window().size()
     }
 
     /// What [`Picture::encode`] writes.
     pub fn format(&self) -> PictureFormat {
-        self.format
+        self.pixels.format()
     }
 
     /// The curve by which a PNG is encoded.
     pub fn transfer(&self) -> Transfer {
-        self.transfer
+        self.pixels.transfer()
+    }
+
+    #[cfg(test)]
+    pub(crate) fn bands(&self) -> Option<&Bands> {
+        self.bands.as_ref()
+    }
+
+    /// What its file says.
+    pub(crate) fn pixels(&self) -> &Pixels {
+        &self.pixels
     }
 
     /// Writes the pixels of `area`, `[y][x]` row by row. The picture's window must have them all.
@@ -150,13 +177,35 @@ impl Picture {
 
     /// The bytes of a tile, row by row, as the picture's file holds them.
     pub(crate) fn encode_tile(&self, tile: &TilePixels<'_>) -> Result<Vec<u8>, PutError> {
-        assert!(self.window.has(tile.area), "the area is one of the picture's");
+        assert!(self.pixels.window().has(tile.area), "the area is one of the picture's");
         tile.check()?;
-        Ok(self.format.encode(tile.bytes, self.transfer))
+        Ok(self.format().encode(tile.bytes, self.transfer()))
     }
 
     /// Writes tiles as the picture's file holds them.
-    pub(crate) fn write(&self, mut tiles: Vec<(Area, Vec<u8>)>) -> io::Result<()> {
+    pub(crate) fn write(&self, tiles: Vec<(Area, Vec<u8>)>) -> io::Result<()> {
+        self.change(tiles, Change::Came)
+    }
+
+    /// Makes an area black, whose pixels are to come again.
+    pub(crate) fn clear(&self, area: Area) -> Result<(), PutError> {
+        let black = vec![[0.0; 3]; area.pixel_count()];
+        let black = self.encode_tile(&TilePixels { area, bytes: pixel_bytes(&black) })?;
+        Ok(self.change(vec![(area, black)], Change::Left)?)
+    }
+
+    /// Has pixels count as come that an earlier process put.
+    pub(crate) fn find(&self, areas: &[Area]) -> io::Result<()> {
+        self.bands.as_ref().map_or(Ok(()), |bands| bands.change(areas, Change::Came, || Ok(())))
+    }
+
+    fn change(&self, tiles: Vec<(Area, Vec<u8>)>, change: Change) -> io::Result<()> {
+        let Some(bands) = &self.bands else { return self.write_rows(tiles) };
+        let areas: Vec<Area> = tiles.iter().map(|(area, _)| *area).collect();
+        bands.change(&areas, change, || self.write_rows(tiles))
+    }
+
+    fn write_rows(&self, mut tiles: Vec<(Area, Vec<u8>)>) -> io::Result<()> {
         tiles.sort_unstable_by_key(|(area, _)| (area.rows().start, area.x0()));
         let is_beside = |(left, _): &(Area, _), (right, _): &(Area, _)| {
             left.rows() == right.rows() && left.columns().end == right.x0()
@@ -172,9 +221,11 @@ impl Picture {
                 }
             }
             let row_bytes = bytes.len() / rows.len();
-            let at_once = if row_bytes == self.row_bytes() { bytes.len() } else { row_bytes };
+            let at_once =
+                if row_bytes == self.pixels.row_bytes() { bytes.len() } else { row_bytes };
             for (y, run) in rows.zip(bytes.chunks_exact(at_once)) {
-                self.disk.write_at(&self.file, run, self.offset_in_frame(x0, y))?;
+                let offset = self.pixels.offset_in_frame(x0, y);
+                self.disk.write_at(self.pixels.file(), run, offset)?;
             }
         }
         Ok(())
@@ -182,56 +233,76 @@ impl Picture {
 
     /// The bytes of `area`, row by row.
     pub(crate) fn read_area(&self, area: Area) -> io::Result<Vec<u8>> {
-        let mut bytes = vec![0; area.pixel_count() * self.format.bytes_per_pixel()];
-        let row_bytes = area.width() as usize * self.format.bytes_per_pixel();
+        let mut bytes = vec![0; area.pixel_count() * self.format().bytes_per_pixel()];
+        let row_bytes = area.width() as usize * self.format().bytes_per_pixel();
         for (y, row) in area.rows().zip(bytes.chunks_exact_mut(row_bytes)) {
-            self.file.read_exact_at(row, self.offset_in_frame(area.x0(), y))?;
+            let offset = self.pixels.offset_in_frame(area.x0(), y);
+            self.pixels.file().read_exact_at(row, offset)?;
         }
         Ok(bytes)
     }
 
     /// The bytes of some pixels of a row of the frame.
     pub(crate) fn read_row(&self, y: u32, columns: Range<u32>) -> io::Result<Vec<u8>> {
-        let mut bytes = vec![0; columns.len() * self.format.bytes_per_pixel()];
-        self.file.read_exact_at(&mut bytes, self.offset_in_frame(columns.start, y))?;
+        let mut bytes = vec![0; columns.len() * self.format().bytes_per_pixel()];
+        let offset = self.pixels.offset_in_frame(columns.start, y);
+        self.pixels.file().read_exact_at(&mut bytes, offset)?;
         Ok(bytes)
     }
 
     /// Makes what was written outlive a power cut.
     pub(crate) fn sync(&self) -> io::Result<()> {
-        self.disk.sync(&self.file)
+        self.disk.sync(self.pixels.file())
     }
 
     /// Writes the whole picture as a file of its format, which says `notes`. The same picture with
     /// the same notes gives the same bytes. A few bands of rows are in memory at a time.
     pub fn encode(&self, notes: &Notes, out: impl Write + Seek) -> io::Result<()> {
-        match self.format {
+        match self.format() {
             PictureFormat::Png8 => png::encode(self, notes, BitDepth::Eight, out),
             PictureFormat::Png16 => png::encode(self, notes, BitDepth::Sixteen, out),
             PictureFormat::ExrF32 => exr::encode(self, notes, out),
         }
     }
 
-    /// The bytes of `count` rows from `y` on.
-    pub(crate) fn read_rows(&self, y: u32, count: u32) -> io::Result<Vec<u8>> {
-        let mut bytes = vec![0; self.row_bytes() * count as usize];
-        self.file.read_exact_at(&mut bytes, self.offset(0, y))?;
-        Ok(bytes)
-    }
-
-    /// Bytes that a row takes.
-    pub(crate) fn row_bytes(&self) -> usize {
-        self.window.width() as usize * self.format.bytes_per_pixel()
-    }
-
-    /// Where the file has a pixel of the frame.
-    fn offset_in_frame(&self, x: u32, y: u32) -> u64 {
-        self.offset(x - self.window.x0(), y - self.window.y0())
-    }
-
-    fn offset(&self, x: u32, y: u32) -> u64 {
-        let pixels = u64::from(y) * u64::from(self.window.width()) + u64::from(x);
-        pixels * self.format.bytes_per_pixel() as u64
+    /// Has `write` write the bands, the uppermost first, each with its rows and compressed. While
+    /// it writes some, all cores compress the next that are not kept.
+    pub(crate) fn each_band<E: From<io::Error>>(
+        &self,
+        mut write: impl FnMut(Range<u32>, Vec<u8>) -> Result<(), E>,
+    ) -> Result<(), E> {
+        let pixels = &self.pixels;
+        let pack = |band: u32| {
+            let kept = self.bands.as_ref().and_then(|bands| bands.take(band));
+            kept.map_or_else(|| pixels.pack(band), Ok)
+        };
+        let (count, band_bytes) =
+            (pixels.band_count(), pixels.rows_of_band(0).len() * pixels.row_bytes());
+        let (least, most) = BANDS_AT_ONCE;
+        let at_once = (BYTES_AT_ONCE / band_bytes).clamp(least, most) as u32;
+        let pack_some = |first: u32| -> io::Result<Vec<Vec<u8>>> {
+            let some = first..count.min(first + at_once);
+            if some.len() == 1 {
+                some.map(pack).collect()
+            } else {
+                some.into_par_iter().map(pack).collect()
+            }
+        };
+        let mut packed = pack_some(0);
+        for first in (0..count).step_by(at_once as usize) {
+            let bands = (first..).zip(packed?);
+            packed = Ok(Vec::new());
+            let next = first + at_once;
+            rayon::in_place_scope(|scope| {
+                if next < count {
+                    scope.spawn(|_| packed = pack_some(next));
+                }
+                bands
+                    .into_iter()
+                    .try_for_each(|(band, bytes)| write(pixels.rows_of_band(band), bytes))
+            })?;
+        }
+        Ok(())
     }
 }
 
