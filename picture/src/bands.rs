@@ -392,7 +392,9 @@ mod tests {
             tiles.sort_unstable();
             let (last, others) = tiles.split_last().unwrap();
             for row in others.chunks(grid().columns() as usize) {
-                row.iter().for_each(|&tile| put(&picture, tile));
+                for &tile in row {
+                    put(&picture, tile);
+                }
             }
             // The last tile's rows are in these.
             let lacking = picture.pixels().bands_of(grid().area(*last)).len();

@@ -82,6 +82,7 @@ pub(crate) fn pack(pixels: &Pixels, rows: Range<u32>) -> io::Result<Vec<u8>> {
     match Compressor::new(level).zlib_compress(packed, &mut compressed) {
         Ok(byte_count) => {
             compressed.truncate(byte_count);
+            compressed.shrink_to_fit();
             Ok(compressed)
         }
         // It would not be shorter.

@@ -73,10 +73,12 @@ pub struct TilePixels<'a> {
 /// Bytes of a pixel in [`TilePixels`].
 pub(crate) const PIXEL_BYTES: usize = 12;
 
-/// Bytes of rows that are compressed at once when a picture is encoded, and as how many bands at
-/// least and at most.
-const BYTES_AT_ONCE: usize = 8 << 20;
-const BANDS_AT_ONCE: (usize, usize) = (8, 64);
+/// Bytes of rows that are compressed at once when a picture is encoded: no more than four bands for
+/// each core, and no fewer than one, of up to [`CORES`].
+const BYTES_AT_ONCE: usize = 4 << 20;
+
+/// Cores that are given a band however long it is.
+const CORES: usize = 8;
 
 /// A picture in a file, row by row from the top left. Tiles may be put from several threads; the
 /// picture itself takes no memory.
@@ -278,8 +280,9 @@ impl Picture {
         };
         let (count, band_bytes) =
             (pixels.band_count(), pixels.rows_of_band(0).len() * pixels.row_bytes());
-        let (least, most) = BANDS_AT_ONCE;
-        let at_once = (BYTES_AT_ONCE / band_bytes).clamp(least, most) as u32;
+        let cores = rayon::current_num_threads();
+        let at_once = BYTES_AT_ONCE / band_bytes;
+        let at_once = at_once.clamp(cores.min(CORES), 4 * cores) as u32;
         let pack_some = |first: u32| -> io::Result<Vec<Vec<u8>>> {
             let some = first..count.min(first + at_once);
             if some.len() == 1 {
