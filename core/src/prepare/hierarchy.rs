@@ -45,11 +45,14 @@ fn frame_around(surfaces: &Surfaces) -> Frame {
     let flat = &surfaces.flat;
     let none = (DVec3::INFINITY, DVec3::NEG_INFINITY);
     let join = |a: (DVec3, DVec3), b: (DVec3, DVec3)| (a.0.min(b.0), a.1.max(b.1));
-    let points = flat.corners[..flat.item_corner_count()].par_iter().map(|&corner| {
-        let point = flat.points[corner as usize];
-        (point, point)
+    let corners = flat.corners[..flat.item_corner_count()].par_chunks(JOINED_AT_ONCE);
+    let bounds = corners.map(|corners| {
+        corners.iter().fold(none, |(min, max), &corner| {
+            let point = flat.points[corner as usize];
+            (min.min(point), max.max(point))
+        })
     });
-    let (min, max) = round_bounds(surfaces).fold(points.reduce(|| none, join), join);
+    let (min, max) = round_bounds(surfaces).fold(bounds.reduce(|| none, join), join);
     if min.x > max.x {
         return Frame { origin: [0.0; 3], scale: 1.0 };
     }

@@ -1,32 +1,25 @@
-//! The builder of the bounding volume hierarchy: binned surface area heuristic, straight into
-//! nodes of eight.
+//! The builder of the bounding volume hierarchy: the surface area heuristic, straight into nodes of
+//! eight.
 //!
-//! Source: Wald, "On fast Construction of SAH-based Bounding Volume Hierarchies" (2007); eight
-//! wide by opening the largest child until there are eight, Wald, Benthin & Boulos, "Getting Rid
-//! of Packets" (2008). The same input gives the same bytes on any number of threads: bins hold
-//! minima, maxima and counts, which do not care for order, and every split is made by one thread.
+//! Source: eight wide by opening the largest child until there are eight, Wald, Benthin & Boulos,
+//! "Getting Rid of Packets" (2008). The same input gives the same bytes on any number of threads:
+//! bins hold minima, maxima and counts, which do not care for order, and every split is made by one
+//! thread.
 
-use std::ops::Range;
+mod primitive;
+mod split;
 
-use glam::Vec4;
 use rayon::prelude::*;
 
+pub(super) use self::primitive::BuildPrimitive;
+use self::split::{Scratch, Side, halve, split};
 use crate::prepared::node::{Child, Node};
 
 /// From this level on, splits are made in the middle, so that a path ends within 28 more.
 const MEDIAN_LEVEL: usize = 32;
 
-/// A range of fewer items is built by one thread.
+/// A range of no more primitives is built by one thread.
 const SERIAL: usize = 4096;
-
-const BINS: usize = 16;
-
-/// Ranges of up to this many items have half as many bins.
-const FEW: usize = 32;
-
-/// Two items are joined where the box around them has less than this part of what their own boxes
-/// have of surface: half of it where these are the same.
-const JOINED: f32 = 0.75;
 
 /// Which ranges are leaves.
 #[derive(Debug, Clone, Copy)]
@@ -37,92 +30,125 @@ pub(super) struct Leaves {
     pub(super) alone_from: u32,
 }
 
-/// An axis-aligned box. The fourth numbers mean nothing: with them a corner is one load.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct Bounds {
-    min: Vec4,
-    max: Vec4,
-}
-
-impl Bounds {
-    const NONE: Self = Self { min: Vec4::INFINITY, max: Vec4::NEG_INFINITY };
-
-    #[inline(always)]
-    fn join(self, other: &Self) -> Self {
-        Self { min: self.min.min(other.min), max: self.max.max(other.max) }
-    }
-
-    #[inline(always)]
-    fn add(&mut self, point: Vec4) {
-        *self = Self { min: self.min.min(point), max: self.max.max(point) };
-    }
-
-    /// Half the surface.
-    #[inline(always)]
-    fn half_area(&self) -> f32 {
-        let [x, y, z, _] = (self.max - self.min).to_array();
-        if x < 0.0 { 0.0 } else { x * y + y * z + z * x }
-    }
-
-    /// Twice the centre.
-    #[inline(always)]
-    fn twice_center(&self) -> Vec4 {
-        self.min + self.max
-    }
-}
-
-/// What the hierarchy is built over: an item, or two that are joined. In the bits of the fourth
-/// numbers of its box are the number of the first one and how many they are.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct BuildPrimitive(Bounds);
-
-impl BuildPrimitive {
-    /// An item of a number and its box.
-    pub(super) fn new([x, y, z]: [f32; 3], max: [f32; 3], item: u32) -> Self {
-        // Of two zeros the smaller one would be a matter of order.
-        let [least_x, least_y, least_z] = [x + 0.0, y + 0.0, z + 0.0];
-        let [x, y, z] = max.map(|x| x + 0.0);
-        let min = Vec4::new(least_x, least_y, least_z, f32::from_bits(item));
-        Self(Bounds { min, max: Vec4::new(x, y, z, f32::from_bits(1)) })
-    }
-
-    /// Joins an item and the next one, where the box around both is so small that no split between
-    /// them would be worth its while: so it is for the two halves of a quadrangle.
-    pub(super) fn joined(&self, next: &Self) -> Option<Self> {
-        let mut both = self.0.join(&next.0);
-        both.min.w = self.0.min.w;
-        both.max.w = f32::from_bits(2);
-        let apart = self.0.half_area() + next.0.half_area();
-        (both.half_area() < JOINED * apart).then_some(Self(both))
-    }
-
-    /// The number of the first item.
-    pub(super) fn item(&self) -> u32 {
-        self.0.min.w.to_bits()
-    }
-
-    /// How many items there are.
-    #[inline(always)]
-    fn count(&self) -> u32 {
-        self.0.max.w.to_bits()
-    }
-
-    /// The numbers of the items.
-    pub(super) fn items(&self) -> Range<u32> {
-        self.item()..self.item() + self.count()
-    }
-}
-
 /// A run of primitives that will be a node or a leaf.
-struct BuildRange<'a> {
-    primitives: &'a mut [BuildPrimitive],
-    /// The place of the first item in the whole order, and how many there are.
+#[derive(Debug, Clone, Copy)]
+struct BuildRange {
+    /// The primitives, among those that it is built with.
+    begin: usize,
+    end: usize,
+    /// The place of the first item in the whole order.
     first: usize,
+    side: Side,
+    /// Half the surface; less than nothing if this is a leaf.
+    to_open: f32,
+}
+
+impl BuildRange {
+    fn new(
+        primitives: &[BuildPrimitive],
+        (begin, end): (usize, usize),
+        (first, side): (usize, Side),
+        leaves: Leaves,
+    ) -> Self {
+        let is_alone = |primitive: &BuildPrimitive| primitive.item() >= leaves.alone_from;
+        let is_leaf = end - begin == 1
+            || side.count <= leaves.most && !primitives[begin..end].iter().any(is_alone);
+        let to_open = if is_leaf { -1.0 } else { side.bounds.half_area() };
+        Self { begin, end, first, side, to_open }
+    }
+
+    /// The leaf, where the range is one.
+    fn as_leaf(&self) -> Option<Child> {
+        (self.to_open < 0.0).then(|| Child::leaf(self.first, self.side.count))
+    }
+
+    /// The two sides of the cheapest split.
+    fn split(
+        &self,
+        primitives: &mut [BuildPrimitive],
+        level: usize,
+        leaves: Leaves,
+        scratch: &mut Scratch,
+    ) -> [Self; 2] {
+        let own = &mut primitives[self.begin..self.end];
+        let (at, sides) =
+            if level < MEDIAN_LEVEL { split(own, &self.side, scratch) } else { halve(own) };
+        let at = self.begin + at;
+        let firsts = [self.first, self.first + sides[0].count];
+        [
+            Self::new(primitives, (self.begin, at), (firsts[0], sides[0]), leaves),
+            Self::new(primitives, (at, self.end), (firsts[1], sides[1]), leaves),
+        ]
+    }
+}
+
+/// The ranges of a node's children, in order.
+struct Opened {
+    ranges: [BuildRange; 8],
     count: usize,
-    bounds: Bounds,
-    /// The bounds of twice the centres.
-    centers: Bounds,
-    leaves: Leaves,
+}
+
+impl Opened {
+    /// Opens a range to eight, if there are so many in it.
+    #[inline(always)]
+    fn new(
+        range: BuildRange,
+        primitives: &mut [BuildPrimitive],
+        level: usize,
+        leaves: Leaves,
+        scratch: &mut Scratch,
+    ) -> Self {
+        let (mut ranges, mut count) = ([range; 8], 1);
+        while count < 8 {
+            let mut largest = 0;
+            for k in 1..count {
+                if ranges[k].to_open > ranges[largest].to_open {
+                    largest = k;
+                }
+            }
+            if ranges[largest].to_open < 0.0 {
+                break;
+            }
+            let [before, behind] = ranges[largest].split(primitives, level, leaves, scratch);
+            ranges.copy_within(largest + 1..count, largest + 2);
+            (ranges[largest], ranges[largest + 1]) = (before, behind);
+            count += 1;
+        }
+        Self { ranges, count }
+    }
+
+    fn ranges(&self) -> &[BuildRange] {
+        &self.ranges[..self.count]
+    }
+
+    /// The node with these boxes, and the leaves among its children.
+    #[inline(always)]
+    fn node(&self) -> Node {
+        let mut node = Node::EMPTY;
+        for (k, range) in self.ranges().iter().enumerate() {
+            let (min, max) = (range.side.bounds.min.to_array(), range.side.bounds.max.to_array());
+            for axis in 0..3 {
+                node.planes[axis][k] = min[axis];
+                node.planes[axis + 3][k] = max[axis];
+            }
+            if let Some(leaf) = range.as_leaf() {
+                node.children[k] = leaf;
+            }
+        }
+        node
+    }
+}
+
+/// Where a node is named: its parent's index, and the place among the parent's children. The root
+/// has none.
+type Place = Option<(usize, usize)>;
+
+/// A range that will be a node, with its primitives alone.
+struct Waiting<'a> {
+    primitives: &'a mut [BuildPrimitive],
+    range: BuildRange,
+    place: Place,
+    level: usize,
 }
 
 /// Builds the hierarchy over `primitives` and brings them into the order in which leaves name their
@@ -131,273 +157,88 @@ pub(super) fn build_bvh(primitives: &mut [BuildPrimitive], leaves: Leaves) -> Ve
     if primitives.is_empty() {
         return vec![Node::EMPTY];
     }
+    let all = (0, primitives.len());
+    let range = BuildRange::new(primitives, all, (0, Side::of(primitives)), leaves);
+    let root = Waiting { primitives, range, place: None, level: 0 };
     let mut nodes = Vec::new();
-    build_node(BuildRange::new(primitives, 0, leaves), 0, &mut nodes);
+    let small = build_top(root, leaves, &mut nodes);
+    let places: Vec<Place> = small.iter().map(|it| it.place).collect();
+    let built: Vec<Vec<Node>> = small
+        .into_par_iter()
+        .map_init(Vec::new, |scratch, Waiting { primitives, range, level, .. }| {
+            let mut below = Vec::with_capacity(primitives.len() / 4);
+            Builder { primitives, leaves, scratch }.add(range, level, &mut below);
+            below
+        })
+        .collect();
+    nodes.reserve_exact(built.iter().map(Vec::len).sum());
+    for (below, place) in built.into_iter().zip(places) {
+        let offset = nodes.len();
+        name_child(&mut nodes, place, offset);
+        nodes.extend(below.into_iter().map(|mut node| {
+            node.children = node.children.map(|child| child.moved_by(offset));
+            node
+        }));
+    }
     nodes
 }
 
-impl<'a> BuildRange<'a> {
-    fn new(primitives: &'a mut [BuildPrimitive], first: usize, leaves: Leaves) -> Self {
-        let nothing = || (Bounds::NONE, Bounds::NONE, 0);
-        let measure = |chunk: &[BuildPrimitive]| {
-            chunk.iter().fold(nothing(), |(bounds, mut centers, count), primitive| {
-                centers.add(primitive.0.twice_center());
-                (bounds.join(&primitive.0), centers, count + primitive.count() as usize)
-            })
-        };
-        let (bounds, centers, count) = if primitives.len() > 8 * SERIAL {
-            primitives
-                .par_chunks(SERIAL)
-                .map(measure)
-                .reduce(nothing, |a, b| (a.0.join(&b.0), a.1.join(&b.1), a.2 + b.2))
-        } else {
-            measure(primitives)
-        };
-        Self { primitives, first, count, bounds, centers, leaves }
-    }
-
-    /// Splits in two where it is cheapest.
-    fn split(self, level: usize) -> [Self; 2] {
-        let split = match level {
-            MEDIAN_LEVEL.. => None,
-            _ if self.primitives.len() <= FEW => self.cheapest_split::<{ BINS / 2 }>(),
-            _ => self.cheapest_split::<BINS>(),
-        };
-        let Self { primitives, first, count, leaves, .. } = self;
-        let Some(split) = split else {
-            // Nothing tells them apart.
-            let (before, behind) = primitives.split_at_mut(primitives.len() / 2);
-            let before = Self::new(before, first, leaves);
-            let at = first + before.count;
-            return [before, Self::new(behind, at, leaves)];
-        };
-        let (at, [left_centers, right_centers]) = split.partition(primitives);
-        let [left, right] = split.sides;
-        let (before, behind) = primitives.split_at_mut(at);
-        [
-            Self {
-                primitives: before,
-                first,
-                count: split.left_count,
-                bounds: left,
-                centers: left_centers,
-                leaves,
-            },
-            Self {
-                primitives: behind,
-                first: first + split.left_count,
-                count: count - split.left_count,
-                bounds: right,
-                centers: right_centers,
-                leaves,
-            },
-        ]
-    }
-
-    /// The leaf, where the range is one.
-    fn as_leaf(&self) -> Option<Child> {
-        self.is_leaf().then(|| Child::leaf(self.first, self.count))
-    }
-
-    fn is_leaf(&self) -> bool {
-        let is_alone = |primitive: &BuildPrimitive| primitive.item() >= self.leaves.alone_from;
-        self.primitives.len() == 1
-            || self.count <= self.leaves.most && !self.primitives.iter().any(is_alone)
-    }
-
-    /// The split between two bins with the least area x count on its sides; `None` where the
-    /// centres do not differ enough for bins.
-    fn cheapest_split<const COUNT: usize>(&self) -> Option<Split> {
-        let extent = (self.centers.max - self.centers.min).to_array();
-        let mut scale = [0.0; 4];
-        for axis in 0..3 {
-            let fitting = COUNT as f32 * (1.0 - f32::EPSILON) / extent[axis];
-            if extent[axis] > 0.0 && fitting.is_finite() {
-                scale[axis] = fitting;
-            }
+/// Adds the nodes of large ranges, level by level; returns the small ones below.
+fn build_top<'a>(root: Waiting<'a>, leaves: Leaves, nodes: &mut Vec<Node>) -> Vec<Waiting<'a>> {
+    let (mut large, mut small) = (vec![root], Vec::new());
+    loop {
+        small.extend(large.extract_if(.., |it| it.primitives.len() <= SERIAL));
+        if large.is_empty() {
+            return small;
         }
-        let scales = Vec4::from_array(scale);
-        let binning = Binning { low: self.centers.min, scale: scales, last: COUNT - 1 };
-        let bins = if self.primitives.len() > 8 * SERIAL {
-            self.primitives
-                .par_chunks(SERIAL)
-                .map(|chunk| binning.fill::<COUNT>(chunk))
-                .reduce_with(|a, b| merge_bins(&a, &b))?
-        } else {
-            binning.fill(self.primitives)
+        let open = |Waiting { primitives, range, place, level }: Waiting<'a>| {
+            let opened = Opened::new(range, primitives, level, leaves, &mut Vec::new());
+            (opened, primitives, place, level)
         };
-        // The cheapest: cost, axis and bin.
-        let mut best: Option<(f32, usize, usize)> = None;
-        for axis in (0..3).filter(|&axis| scale[axis] > 0.0) {
-            let mut right_cost = [0.0; COUNT];
-            let mut side = Bin::EMPTY;
-            for bin in (1..COUNT).rev() {
-                side = side.join(&bins[axis][bin]);
-                right_cost[bin] = side.bounds.half_area() * side.count as f32;
-            }
-            side = Bin::EMPTY;
-            for bin in 1..COUNT {
-                side = side.join(&bins[axis][bin - 1]);
-                let cost = side.bounds.half_area() * side.count as f32 + right_cost[bin];
-                let is_split = side.count > 0 && (side.count as usize) < self.count;
-                if is_split && best.is_none_or(|best| cost < best.0) {
-                    best = Some((cost, axis, bin));
+        let opened: Vec<_> = large.into_par_iter().map(open).collect();
+        large = Vec::new();
+        for (opened, mut primitives, place, level) in opened {
+            let own = nodes.len();
+            name_child(nodes, place, own);
+            nodes.push(opened.node());
+            for (k, range) in opened.ranges().iter().enumerate() {
+                let count = range.end - range.begin;
+                let (these, others) = primitives.split_at_mut(count);
+                primitives = others;
+                if range.as_leaf().is_none() {
+                    let range = BuildRange { begin: 0, end: count, ..*range };
+                    let (place, level) = (Some((own, k)), level + 1);
+                    large.push(Waiting { primitives: these, range, place, level });
                 }
             }
         }
-        let (_, axis, bin) = best?;
-        let join =
-            |bins: &[Bin]| bins.iter().fold(Bounds::NONE, |bounds, bin| bounds.join(&bin.bounds));
-        let (left, right) = bins[axis].split_at(bin);
-        let left_count = left.iter().map(|bin| bin.count as usize).sum();
-        Some(Split { axis, bin, left_count, sides: [join(left), join(right)], binning })
     }
 }
 
-#[derive(Clone, Copy)]
-struct Binning {
-    low: Vec4,
-    scale: Vec4,
-    /// The number of the last bin, all ones in binary.
-    last: usize,
-}
-
-#[derive(Clone, Copy)]
-struct Bin {
-    bounds: Bounds,
-    /// How many items.
-    count: u32,
-}
-
-struct Split {
-    axis: usize,
-    bin: usize,
-    /// How many items are left of it.
-    left_count: usize,
-    /// What is on each side.
-    sides: [Bounds; 2],
-    binning: Binning,
-}
-
-impl Bin {
-    const EMPTY: Self = Self { bounds: Bounds::NONE, count: 0 };
-
-    fn join(self, other: &Self) -> Self {
-        Self { bounds: self.bounds.join(&other.bounds), count: self.count + other.count }
+fn name_child(nodes: &mut [Node], place: Place, child: usize) {
+    if let Some((parent, k)) = place {
+        nodes[parent].children[k] = Child::inner(child);
     }
 }
 
-fn merge_bins<const COUNT: usize>(
-    a: &[[Bin; COUNT]; 3],
-    b: &[[Bin; COUNT]; 3],
-) -> [[Bin; COUNT]; 3] {
-    std::array::from_fn(|axis| std::array::from_fn(|bin| a[axis][bin].join(&b[axis][bin])))
+/// What one thread builds.
+struct Builder<'a> {
+    primitives: &'a mut [BuildPrimitive],
+    leaves: Leaves,
+    scratch: &'a mut Scratch,
 }
 
-impl Binning {
-    /// The bin of a box on each axis.
-    #[inline(always)]
-    fn bins(&self, bounds: &Bounds) -> [usize; 3] {
-        // Up to the next power of two the bits of a number from here on count in ones.
-        const ONES: f32 = (3 << 22) as f32;
-        let at = (bounds.twice_center() - self.low) * self.scale;
-        let [x, y, z, _] = (at - 0.5 + ONES).to_array();
-        [x, y, z].map(|x| x.to_bits() as usize & self.last)
-    }
-
-    fn fill<const COUNT: usize>(&self, primitives: &[BuildPrimitive]) -> [[Bin; COUNT]; 3] {
-        let mut bins = [[Bin::EMPTY; COUNT]; 3];
-        for primitive in primitives {
-            for (bins, bin) in bins.iter_mut().zip(self.bins(&primitive.0)) {
-                let bin = &mut bins[bin % COUNT];
-                bin.bounds = bin.bounds.join(&primitive.0);
-                bin.count += primitive.count();
-            }
-        }
-        bins
-    }
-}
-
-impl Split {
-    /// Brings those left of the split to the front; returns how many they are, and the bounds of
-    /// twice the centres on each side.
-    fn partition(&self, primitives: &mut [BuildPrimitive]) -> (usize, [Bounds; 2]) {
-        let is_left =
-            |primitive: &BuildPrimitive| self.binning.bins(&primitive.0)[self.axis] < self.bin;
-        let [mut before, mut behind] = [Bounds::NONE; 2];
-        let (mut left, mut right) = (0, primitives.len());
-        loop {
-            while left < right && is_left(&primitives[left]) {
-                before.add(primitives[left].0.twice_center());
-                left += 1;
-            }
-            while left < right && !is_left(&primitives[right - 1]) {
-                behind.add(primitives[right - 1].0.twice_center());
-                right -= 1;
-            }
-            if left >= right {
-                return (left, [before, behind]);
-            }
-            primitives.swap(left, right - 1);
-        }
-    }
-}
-
-/// Adds the nodes of one range, its own first; children's indices count from the first of `nodes`.
-fn build_node(range: BuildRange<'_>, level: usize, nodes: &mut Vec<Node>) {
-    let mut ranges = vec![range];
-    while ranges.len() < 8 {
-        let widest = (0..ranges.len())
-            .filter(|&k| !ranges[k].is_leaf())
-            .max_by(|&a, &b| ranges[a].bounds.half_area().total_cmp(&ranges[b].bounds.half_area()));
-        let Some(widest) = widest else { break };
-        let halves = ranges.swap_remove(widest).split(level);
-        ranges.extend(halves);
-    }
-    ranges.sort_by_key(|range| range.first);
-    let mut node = Node::EMPTY;
-    for (k, range) in ranges.iter().enumerate() {
-        for axis in 0..3 {
-            node.planes[axis][k] = range.bounds.min[axis];
-            node.planes[axis + 3][k] = range.bounds.max[axis];
-        }
-    }
-    let own = nodes.len();
-    nodes.push(node);
-    let total: usize = ranges.iter().map(|range| range.count).sum();
-    if total <= SERIAL {
-        for (k, range) in ranges.into_iter().enumerate() {
-            if let Some(leaf) = range.as_leaf() {
-                nodes[own].children[k] = leaf;
-            } else {
+impl Builder<'_> {
+    /// Adds the nodes of a range, its own first.
+    fn add(&mut self, range: BuildRange, level: usize, nodes: &mut Vec<Node>) {
+        let Self { primitives, leaves, scratch } = self;
+        let opened = Opened::new(range, primitives, level, *leaves, scratch);
+        let own = nodes.len();
+        nodes.push(opened.node());
+        for (k, &range) in opened.ranges().iter().enumerate() {
+            if range.as_leaf().is_none() {
                 nodes[own].children[k] = Child::inner(nodes.len());
-                build_node(range, level + 1, nodes);
-            }
-        }
-        return;
-    }
-    let build = |range: BuildRange<'_>| {
-        range.as_leaf().map_or_else(
-            || {
-                let mut below = Vec::new();
-                build_node(range, level + 1, &mut below);
-                Ok(below)
-            },
-            Err,
-        )
-    };
-    let built: Vec<Result<Vec<Node>, Child>> = ranges.into_par_iter().map(build).collect();
-    nodes.reserve_exact(built.iter().flatten().map(Vec::len).sum());
-    for (k, child) in built.into_iter().enumerate() {
-        match child {
-            Err(leaf) => nodes[own].children[k] = leaf,
-            Ok(subtree) => {
-                let offset = nodes.len();
-                nodes[own].children[k] = Child::inner(offset);
-                nodes.par_extend(subtree.into_par_iter().with_min_len(SERIAL).map(|mut node| {
-                    node.children = node.children.map(|child| child.moved_by(offset));
-                    node
-                }));
+                self.add(range, level + 1, nodes);
             }
         }
     }
@@ -408,7 +249,7 @@ mod tests {
     use glam::Vec3;
     use rtfarm_oracle::hard_case::HardCase;
 
-    use super::*;
+    use super::{primitive::Bounds, *};
     use crate::prepared::node::MOST_LEVELS;
 
     const LEAVES: Leaves = Leaves { most: 4, alone_from: u32::MAX };
@@ -527,14 +368,13 @@ mod tests {
         HardCase::CentroidsOneUlpApart.tell("middles one ulp apart end in leaves", measured);
     }
 
-    type Splitter = fn(&BuildRange<'_>) -> Option<(usize, usize, f32)>;
+    type Splitter = fn(&[BuildPrimitive]) -> (usize, usize);
 
-    /// The cheapest of all splits between neighbours in the order of their centres: axis, place,
-    /// cost.
-    fn swept_split(range: &BuildRange<'_>) -> Option<(usize, usize, f32)> {
-        let mut best: Option<(usize, usize, f32)> = None;
+    /// The cheapest of all splits between neighbours in the order of their centres: axis and place.
+    fn swept_split(primitives: &[BuildPrimitive]) -> (usize, usize) {
+        let mut best = (f32::INFINITY, 0, 0);
         for axis in 0..3 {
-            let mut sorted = range.primitives.to_vec();
+            let mut sorted = primitives.to_vec();
             sorted.sort_by(|a, b| a.0.twice_center()[axis].total_cmp(&b.0.twice_center()[axis]));
             let mut right_cost = vec![0.0; sorted.len()];
             let mut side = Bounds::NONE;
@@ -546,31 +386,74 @@ mod tests {
             for k in 1..sorted.len() {
                 side = side.join(&sorted[k - 1].0);
                 let cost = side.half_area() * k as f32 + right_cost[k];
-                if best.is_none_or(|best| cost < best.2) {
-                    best = Some((axis, k, cost));
+                if cost < best.0 {
+                    best = (cost, axis, k);
                 }
             }
         }
-        best
+        (best.1, best.2)
     }
 
     /// The cost of a binary tree by the surface area heuristic, split by split, in areas of the
     /// root: with the builder's splits, or where `splitter` says.
-    fn cost(range: BuildRange<'_>, splitter: Option<Splitter>, root_area: f64) -> f64 {
-        let area = f64::from(range.bounds.half_area()) / root_area;
-        if range.is_leaf() {
-            return area * range.primitives.len() as f64;
+    fn cost(
+        primitives: &mut [BuildPrimitive],
+        side: Side,
+        splitter: Option<Splitter>,
+        root_area: f64,
+    ) -> f64 {
+        let area = f64::from(side.bounds.half_area()) / root_area;
+        if primitives.len() <= LEAVES.most {
+            return area * primitives.len() as f64;
         }
-        let halves = match splitter.and_then(|splitter| splitter(&range)) {
-            None => range.split(0),
-            Some((axis, at, _)) => {
-                let middle = |primitive: &BuildPrimitive| primitive.0.twice_center()[axis];
-                range.primitives.sort_by(|a, b| middle(a).total_cmp(&middle(b)));
-                let (left, right) = range.primitives.split_at_mut(at);
-                [left, right].map(|half| BuildRange::new(half, 0, LEAVES))
-            }
+        let (at, sides) = if let Some(splitter) = splitter {
+            let (axis, at) = splitter(primitives);
+            let middle = |primitive: &BuildPrimitive| primitive.0.twice_center()[axis];
+            primitives.sort_by(|a, b| middle(a).total_cmp(&middle(b)));
+            (at, [Side::of(&primitives[..at]), Side::of(&primitives[at..])])
+        } else {
+            split(primitives, &side, &mut Vec::new())
         };
-        area + halves.into_iter().map(|half| cost(half, splitter, root_area)).sum::<f64>()
+        let (before, behind) = primitives.split_at_mut(at);
+        area + cost(before, sides[0], splitter, root_area)
+            + cost(behind, sides[1], splitter, root_area)
+    }
+
+    #[test]
+    fn what_a_split_tells_of_its_sides_is_so() {
+        let boxes = scattered(3000);
+        let primitives: Vec<BuildPrimitive> = (0..)
+            .zip(boxes)
+            .map(|(item, (min, max))| BuildPrimitive::new(min, max, item))
+            .collect();
+        for count in [2, 3, 5, 8, 9, 32, 33, 1000, 3000] {
+            let mut primitives = primitives[..count].to_vec();
+            let whole = Side::of(&primitives);
+            let (at, sides) = split(&mut primitives, &whole, &mut Vec::new());
+            let truth = [Side::of(&primitives[..at]), Side::of(&primitives[at..])];
+            let corners = |bounds: &Bounds| [bounds.min.truncate(), bounds.max.truncate()];
+            for (side, truth) in sides.iter().zip(&truth) {
+                assert_eq!(side.count, truth.count);
+                assert_eq!(corners(&side.bounds), corners(&truth.bounds));
+                assert!(side.count <= 8 || corners(&side.centers) == corners(&truth.centers));
+            }
+            if count <= 8 {
+                let best = swept_split(&primitives);
+                let mut swept = primitives.clone();
+                let middle = |primitive: &BuildPrimitive| primitive.0.twice_center()[best.0];
+                swept.sort_by(|a, b| middle(a).total_cmp(&middle(b)));
+                let cost = |primitives: &[BuildPrimitive]| {
+                    Side::of(primitives).bounds.half_area() * primitives.len() as f32
+                };
+                let (found, least) = (
+                    cost(&primitives[..at]) + cost(&primitives[at..]),
+                    cost(&swept[..best.1]) + cost(&swept[best.1..]),
+                );
+                assert!(found <= least * (1.0 + 1e-5), "{count}: {found} {least}");
+            }
+            primitives.sort_by_key(BuildPrimitive::item);
+            assert!(primitives.iter().map(BuildPrimitive::item).eq(0..count as u32));
+        }
     }
 
     #[test]
@@ -586,9 +469,8 @@ mod tests {
             .collect();
         let cost_of = |splitter| {
             let mut primitives = primitives.clone();
-            let range = BuildRange::new(&mut primitives, 0, LEAVES);
-            let area = f64::from(range.bounds.half_area());
-            cost(range, splitter, area)
+            let side = Side::of(&primitives);
+            cost(&mut primitives, side, splitter, f64::from(side.bounds.half_area()))
         };
         let (binned, swept) = (cost_of(None), cost_of(Some(swept_split as Splitter)));
         HardCase::TeapotInStadium.tell(
