@@ -186,7 +186,7 @@ impl<'a> View<'a> {
     }
 
     /// How many vertices there are.
-    pub(super) fn vertex_count(&self) -> usize {
+    pub(crate) fn vertex_count(&self) -> usize {
         self.vertices.len() + self.single_vertices.len()
     }
 

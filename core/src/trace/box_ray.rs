@@ -11,7 +11,7 @@ use crate::{
 };
 
 /// A ray ready to meet boxes, in the boxes' frame.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone, Copy, bytemuck::Zeroable)]
 pub(super) struct BoxRay {
     /// Which of a node's planes is met first on each axis, and which last.
     pub(super) near: [usize; 3],

@@ -18,28 +18,25 @@ use crate::prepared::{
 };
 
 /// Rays on their way at a time.
-const FLIGHTS: usize = 8;
+const FLIGHTS: usize = 16;
+
+/// So many vertices do not fit in the nearer caches.
+const MANY_VERTICES: usize = 1 << 17;
 
 /// A ray on its way.
-#[derive(Debug)]
+#[derive(Debug, bytemuck::Zeroable)]
 struct Flight {
     traversal: Traversal,
     shear: Shear,
     /// Its place among the members.
     place: usize,
+    /// Whether the corners of the leaf that comes next have been asked for.
+    awaits_corners: bool,
 }
 
 /// Room for rays on their way and for a node.
-#[derive(Debug)]
+#[derive(Debug, bytemuck::Zeroable)]
 pub(super) struct Flights([Flight; FLIGHTS], Node);
-
-impl Default for Flights {
-    fn default() -> Self {
-        let shear = Shear { axes: [0; 3], origin: [0.0; 3], slopes: [0.0; 3] };
-        let flight = || Flight { traversal: Traversal::default(), shear, place: 0 };
-        Self(std::array::from_fn(|_| flight()), Node::EMPTY)
-    }
-}
 
 impl Flight {
     #[inline(always)]
@@ -48,6 +45,7 @@ impl Flight {
         self.traversal.start(box_ray, Child::ROOT);
         self.shear = Shear::new(ray.origin, ray.direction);
         self.place = place;
+        self.awaits_corners = false;
     }
 }
 
@@ -63,7 +61,7 @@ pub(super) fn visit_alone(
     if members.is_empty() {
         return;
     }
-    let Flights(flights, room) = &mut **flights.get_or_insert_default();
+    let Flights(flights, room) = &mut **flights.get_or_insert_with(bytemuck::zeroed_box);
     let mut flying = [0; FLIGHTS];
     let mut count = 0;
     while count < FLIGHTS.min(members.len()) {
@@ -71,12 +69,19 @@ pub(super) fn visit_alone(
         flying[count] = count;
         count += 1;
     }
+    let has_many_vertices = view.vertex_count() >= MANY_VERTICES;
     let mut next = count;
     let mut turn = 0;
     while count > 0 {
         let flight = &mut flights[flying[turn] % FLIGHTS];
-        let Flight { traversal, shear, place } = &mut *flight;
-        if step(kernel, view, (traversal, room), (*place, shear), meeting).is_none() {
+        let Flight { traversal, shear, place, awaits_corners } = &mut *flight;
+        let current = traversal.current();
+        *awaits_corners = has_many_vertices && current.is_leaf() && !*awaits_corners;
+        if *awaits_corners {
+            prefetch_corners(kernel, view, current);
+            turn += 1;
+        } else if step::<true>(kernel, view, (traversal, room), (*place, shear), meeting).is_none()
+        {
             prefetch(kernel, view, traversal.current());
             turn += 1;
         } else if let Some(&member) = members.get(next) {
@@ -93,9 +98,10 @@ pub(super) fn visit_alone(
     }
 }
 
-/// A ray enters the child that comes next. When its way ends: whether its answer is known.
+/// A ray enters the child that comes next. When its way ends: whether its answer is known. It may be
+/// alone all the way.
 #[inline(always)]
-pub(super) fn step(
+pub(super) fn step<const IS_ALONE: bool>(
     kernel: impl BoxKernel,
     view: &View<'_>,
     (traversal, room): (&mut Traversal, &mut Node),
@@ -109,7 +115,7 @@ pub(super) fn step(
         }
         traversal.leave().then_some(false)
     } else {
-        traversal.enter(kernel, view, room).then_some(false)
+        traversal.enter::<IS_ALONE>(kernel, view, room).then_some(false)
     }
 }
 
@@ -165,11 +171,29 @@ fn meet_leaf(
     false
 }
 
+/// Asks for the corners of the triangles in a leaf. What else is in it has none, and asks for some
+/// vertex or nothing.
+#[inline(always)]
+fn prefetch_corners(kernel: impl BoxKernel, view: &View<'_>, leaf: Child) {
+    for face in &view.faces[leaf.items()] {
+        for vertex in face.vertices {
+            let vertex = vertex as usize;
+            if let Some(vertex) = view.vertices.get(vertex) {
+                kernel.prefetch(vertex);
+            } else if let Some(vertex) = view.single_vertices.get(vertex - view.vertices.len()) {
+                kernel.prefetch(vertex);
+            }
+        }
+    }
+}
+
 /// Asks for the node or the records of a child.
 #[inline(always)]
 fn prefetch(kernel: impl BoxKernel, view: &View<'_>, child: Child) {
     if child.is_leaf() {
-        kernel.prefetch(&view.faces[child.items().start]);
+        let items = child.items();
+        kernel.prefetch(&view.faces[items.start]);
+        kernel.prefetch(&view.faces[items.end - 1]);
     } else if let Some(node) = view.nodes.get(child.node()) {
         kernel.prefetch(node);
     } else {

@@ -430,7 +430,8 @@ impl Packet {
         let Stack(traversal, room) = stack;
         traversal.start(box_ray, child);
         let is_known = loop {
-            if let Some(is_known) = step(kernel, view, (traversal, room), (place, &shear), meeting)
+            if let Some(is_known) =
+                step::<false>(kernel, view, (traversal, room), (place, &shear), meeting)
             {
                 break is_known;
             }

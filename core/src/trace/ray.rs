@@ -74,7 +74,7 @@ impl Hit {
 ///
 /// Source: Woop, Benthin & Wald, "Watertight Ray/Triangle Intersection" (2013): the direction's
 /// largest component becomes the depth axis and the other two are sheared along it.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone, Copy, bytemuck::Zeroable)]
 pub(super) struct Shear {
     pub(super) axes: [usize; 3],
     pub(super) origin: [f64; 3],

@@ -12,7 +12,7 @@ pub(super) const STACK: usize = 7 * MOST_LEVELS + 8;
 
 /// A ray on its way, nearer boxes first, and room for what waits; kept from ray to ray, for to fill
 /// it anew for each would cost as much as the ray.
-#[derive(Debug)]
+#[derive(Debug, bytemuck::Zeroable)]
 pub(super) struct Traversal {
     pub(super) box_ray: BoxRay,
     current: Child,
@@ -74,9 +74,10 @@ impl Traversal {
         self.current
     }
 
-    /// Enters the node that comes next; whether the way ends there.
+    /// Enters the node that comes next; whether the way ends there. In rays that are alone all
+    /// the way (`IS_ALONE`) two children are put in order apart.
     #[inline(always)]
-    pub(super) fn enter(
+    pub(super) fn enter<const IS_ALONE: bool>(
         &mut self,
         kernel: impl BoxKernel,
         view: &View<'_>,
@@ -84,8 +85,23 @@ impl Traversal {
     ) -> bool {
         let node = view.node(self.current.node(), room);
         let (distances, mut mask) = kernel.test(node, &self.box_ray);
-        if mask.is_power_of_two() {
-            self.current = node.children[mask.trailing_zeros() as usize & 7];
+        if mask == 0 {
+            return self.leave();
+        }
+        let child = mask.trailing_zeros() as usize & 7;
+        let others = mask & (mask - 1);
+        if others == 0 {
+            self.current = node.children[child];
+            return false;
+        }
+        if IS_ALONE && others.is_power_of_two() {
+            // Which one is nearer is new each time: no branch is to guess it.
+            let other = others.trailing_zeros() as usize & 7;
+            let is_nearer = distances[child] < distances[other];
+            let (near, far) = if is_nearer { (child, other) } else { (other, child) };
+            self.stack[self.waiting] = (distances[far], node.children[far]);
+            self.waiting += 1;
+            self.current = node.children[near];
             return false;
         }
         let first = self.waiting;
@@ -153,7 +169,7 @@ pub(super) fn visit_nodes(
             items.any(|item| meet(item, box_ray).take(box_ray)) || traversal.leave()
         } else {
             enter();
-            traversal.enter(kernel, view, room)
+            traversal.enter::<false>(kernel, view, room)
         };
         if ends {
             return;
