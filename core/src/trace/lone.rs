@@ -6,7 +6,7 @@
 
 use super::{
     box_ray::BoxRay,
-    boxes::BoxKernel,
+    boxes::{BoxKernel, KernelWork},
     lanes::FACES,
     meeting::Meeting,
     ray::{Ray, Shear},
@@ -58,10 +58,37 @@ pub(super) fn visit_alone(
     flights: &mut Option<Box<Flights>>,
     meeting: &mut impl Meeting,
 ) {
-    if members.is_empty() {
-        return;
+    if !members.is_empty() {
+        let flights = flights.get_or_insert_with(bytemuck::zeroed_box);
+        kernel.run(view, &mut Alone { rays, members, flights, meeting });
     }
-    let Flights(flights, room) = &mut **flights.get_or_insert_with(bytemuck::zeroed_box);
+}
+
+/// Rays that go alone, in a function of their own: in one with packets either would be slower for
+/// the registers that the other takes.
+struct Alone<'a, M> {
+    rays: &'a [Ray],
+    members: &'a [u16],
+    flights: &'a mut Flights,
+    meeting: &'a mut M,
+}
+
+impl<M: Meeting> KernelWork<View<'_>> for Alone<'_, M> {
+    #[inline(always)]
+    fn run(&mut self, view: &View<'_>, kernel: impl BoxKernel) {
+        let Self { rays, members, flights, meeting } = self;
+        take_turns(kernel, view, (rays, members), flights, *meeting);
+    }
+}
+
+#[inline(always)]
+fn take_turns(
+    kernel: impl BoxKernel,
+    view: &View<'_>,
+    (rays, members): (&[Ray], &[u16]),
+    Flights(flights, room): &mut Flights,
+    meeting: &mut impl Meeting,
+) {
     let mut flying = [0; FLIGHTS];
     let mut count = 0;
     while count < FLIGHTS.min(members.len()) {
