@@ -93,7 +93,8 @@ pub(crate) enum Change {
 }
 
 impl Bands {
-    /// Bands of a black picture, to be kept in a file of `folder`; `None` when the picture is small.
+    /// Bands of a picture none of whose pixels count as come yet, to be kept in a file of `folder`;
+    /// `None` when the picture is small.
     pub(crate) fn new(pixels: &Pixels, folder: &Path) -> Option<Self> {
         let byte_count = pixels.row_bytes() as u64 * u64::from(pixels.window().height());
         if byte_count < LEAST_BYTES {
@@ -120,45 +121,45 @@ impl Bands {
         write: impl FnOnce() -> io::Result<T>,
     ) -> io::Result<T> {
         let pixels = &self.shared.pixels;
-        let each_band = |state: &mut State, act: &mut dyn FnMut(&mut Band, u64)| {
-            for area in areas {
-                for index in pixels.bands_of(*area) {
-                    let rows = pixels.rows_of_band(index);
-                    let count = pixel_count(&rows, pixels.window(), *area);
-                    act(&mut state.bands[index as usize], count);
-                }
-            }
+        let touched = || {
+            areas.iter().flat_map(|&area| {
+                let count =
+                    move |band| pixel_count(&pixels.rows_of_band(band), pixels.window(), area);
+                pixels.bands_of(area).map(move |band| (band, count(band)))
+            })
         };
-        each_band(&mut self.shared.state(), &mut |band, _| {
-            band.writers += 1;
-            band.version += 1;
-            band.kept = None;
-        });
+        {
+            let mut state = self.shared.state();
+            for (index, _) in touched() {
+                let band = &mut state.bands[index as usize];
+                band.writers += 1;
+                band.version += 1;
+                band.kept = None;
+            }
+        }
         let written = write();
-        let is_written = written.is_ok();
-        let mut state = self.shared.state();
-        each_band(&mut state, &mut |band, count| {
+        let state = &mut *self.shared.state();
+        for (index, count) in touched() {
+            let band = &mut state.bands[index as usize];
             band.writers -= 1;
             match change {
-                Change::Came if is_written => band.missing = band.missing.saturating_sub(count),
+                Change::Came if written.is_ok() => {
+                    band.missing = band.missing.saturating_sub(count);
+                }
                 Change::Came => {}
                 Change::Left => band.missing += count,
             }
-        });
-        for area in areas {
-            for index in pixels.bands_of(*area) {
-                let band = &mut state.bands[index as usize];
-                if band.missing == 0 && band.writers == 0 && !band.is_waiting {
-                    band.is_waiting = true;
-                    state.waiting.push_back(index);
-                }
+            if band.missing == 0 && band.writers == 0 && !band.is_waiting {
+                band.is_waiting = true;
+                state.waiting.push_back(index);
             }
         }
-        self.shared.start_packers(&mut state);
+        self.shared.start_packers(state);
         written
     }
 
-    /// What is kept of a band. The caller compresses it where nothing is.
+    /// What is kept of a band, which is not compressed early any more unless somebody writes to
+    /// it. The caller compresses it where nothing is kept.
     pub(crate) fn take(&self, index: u32) -> Option<Vec<u8>> {
         let (file, (offset, byte_count)) = {
             let mut state = self.shared.state();
@@ -413,6 +414,24 @@ mod tests {
             assert_eq!(settle(&picture), all - lacking, "{format:?}");
             put(&picture, tiles[17]);
             assert!(encoded(&picture) == expected);
+        }
+    }
+
+    #[test]
+    fn a_band_does_not_depend_on_the_one_above() {
+        let folder = tempfile::tempdir().unwrap();
+        for format in FORMATS {
+            let picture = picture_of(format).packed_early(folder.path());
+            for band in (0..picture.pixels().band_count()).rev() {
+                let rows = picture.pixels().rows_of_band(band);
+                let size = grid().window().size();
+                let sides = [size.width(), rows.len() as u32];
+                let area = Area::new(size, [0, rows.start], sides).unwrap();
+                let pixels: Vec<[f32; 3]> = area.pixels().map(|(x, y)| pixel(x, y)).collect();
+                picture.put(area, &pixels).unwrap();
+                settle(&picture);
+            }
+            assert!(encoded(&picture) == expected(format), "{format:?}");
         }
     }
 

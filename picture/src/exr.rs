@@ -60,13 +60,13 @@ pub(crate) fn encode(picture: &Picture, notes: &Notes, out: impl Write + Seek) -
 
 /// A block's bytes: compressed, or as they are where that is not longer.
 ///
-/// Source: Academy Software Foundation, "`OpenEXR` File Layout" and `internal_zip.c` of its library:
-/// the bytes with even places, then those with odd ones; each, but the first, as its difference
+/// Source: Academy Software Foundation, "`OpenEXR` File Layout" and `internal_zip.c` of its
+/// library: the bytes with even places, then those with odd ones; each, but the first, as its difference
 /// from the one before plus 128; that as a zlib stream.
 pub(crate) fn pack(pixels: &Pixels, rows: Range<u32>) -> io::Result<Vec<u8>> {
     let mut bytes = Vec::new();
     pixels.read_rows(rows, &mut bytes)?;
-    let mut block = planes_of(&bytes, pixels.row_bytes());
+    let block = planes_of(&bytes, pixels.row_bytes());
     let packed = &mut bytes;
     let (even, odd) = packed.split_at_mut(block.len() / 2);
     for ((pair, even), odd) in block.chunks_exact(2).zip(even).zip(odd) {
@@ -86,7 +86,7 @@ pub(crate) fn pack(pixels: &Pixels, rows: Range<u32>) -> io::Result<Vec<u8>> {
             Ok(compressed)
         }
         // It would not be shorter.
-        Err(_) => Ok(std::mem::take(&mut block)),
+        Err(_) => Ok(block),
     }
 }
 

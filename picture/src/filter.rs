@@ -10,10 +10,10 @@ pub(crate) struct RowFilter {
 }
 
 impl RowFilter {
-    /// A filter's number and the row filtered by it. Of the filters the one is chosen that gives
-    /// the least sum of absolute differences (section 12.7 of the specification). `row` and the
-    /// row above, `above`, have equally many bytes, and at least one pixel of `pixel_bytes` bytes;
-    /// above the first row stand zeros.
+    /// A filter's number and the row filtered by it. Of filters 1 to 4 the one is chosen that
+    /// gives the least sum of absolute differences (section 12.7 of the specification). `row` and
+    /// the row above, `above`, have equally many bytes, and at least one pixel of `pixel_bytes`
+    /// bytes.
     pub(crate) fn filter(&mut self, above: &[u8], row: &[u8], pixel_bytes: usize) -> &[u8] {
         let mut least = u64::MAX;
         self.best.resize(1 + row.len(), 0);
@@ -31,6 +31,15 @@ impl RowFilter {
                 }
             }
         }
+        &self.best
+    }
+
+    /// The same for the first row of a band, by filter 1, which needs no row above: that is
+    /// another band's, and may change after this one was compressed.
+    pub(crate) fn filter_first(&mut self, row: &[u8], pixel_bytes: usize) -> &[u8] {
+        self.best.resize(1 + row.len(), 0);
+        self.best[0] = 1;
+        sub(&[], row, pixel_bytes, &mut self.best[1..]);
         &self.best
     }
 }

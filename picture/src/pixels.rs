@@ -43,7 +43,7 @@ impl Pixels {
         self.window.width() as usize * self.format.bytes_per_pixel()
     }
 
-    /// Reads rows of the window behind what `bytes` has.
+    /// Appends rows of the window to `bytes`, as the file has them.
     pub(crate) fn read_rows(&self, rows: Range<u32>, bytes: &mut Vec<u8>) -> io::Result<()> {
         let at = bytes.len();
         bytes.resize(at + self.row_bytes() * rows.len(), 0);
@@ -84,7 +84,7 @@ impl Pixels {
         }
     }
 
-    /// Compresses a band, which depends on the picture alone.
+    /// Compresses a band: what comes of it depends on the band's pixels alone.
     pub(crate) fn pack(&self, band: u32) -> io::Result<Vec<u8>> {
         let rows = self.rows_of_band(band);
         match self.format {

@@ -24,7 +24,8 @@ const ADLER_BYTES: usize = 4;
 const AT_ONCE: usize = 1 << 16;
 
 /// Rows of a band: about 1 MiB, so that what a band costs of its own, 70 bytes, is little even
-/// where the picture is flat. They depend on nothing but what a row takes.
+/// where the picture is flat; whole tiles of 16 rows, so that few tiles are in two bands. They
+/// depend on nothing but what a row takes, and the bytes of a file on them.
 pub(crate) fn band_rows(row_bytes: usize) -> u32 {
     let rows = (1 << 20) / row_bytes as u32;
     if rows < 16 { rows.max(1) } else { rows / 16 * 16 }
@@ -49,13 +50,13 @@ pub(crate) fn encode(
         }
     }
     let mut writer = encoder.write_header()?;
-    let (mut is_first, mut checksum) = (true, 1);
+    let mut checksum = 1;
     picture.each_band(|rows, mut band| {
         let of_band = band.split_off(band.len() - ADLER_BYTES);
         let of_band = u32::from_be_bytes(of_band.try_into().expect("it has so many bytes"));
         let byte_count = rows.len() as u64 * (1 + picture.pixels().row_bytes() as u64);
         checksum = join_adler32(checksum, of_band, byte_count);
-        if std::mem::take(&mut is_first) {
+        if rows.start == 0 {
             drop(band.splice(..0, ZLIB_HEADER));
         }
         if rows.end == picture.size().height() {
@@ -69,24 +70,23 @@ pub(crate) fn encode(
 }
 
 /// A band's blocks of deflate, none of which is the last one and which refer to nothing before
-/// them, up to a byte's end; then the Adler-32 of what is in them.
+/// them, up to a byte's end; then the Adler-32 of what is in them. Nor do its filters refer to the
+/// rows before.
 pub(crate) fn pack(pixels: &Pixels, rows: Range<u32>) -> io::Result<Vec<u8>> {
     let (row_bytes, pixel_bytes) = (pixels.row_bytes(), pixels.format().bytes_per_pixel());
     let (mut above, mut row) = (Vec::new(), Vec::new());
-    if rows.start == 0 {
-        // Above the first row of the picture stand zeros.
-        above.resize(row_bytes, 0);
-    } else {
-        pixels.read_rows(rows.start - 1..rows.start, &mut above)?;
-    }
     let mut filter = RowFilter::default();
     let mut compressor = Compressor::new(Vec::with_capacity(rows.len() * row_bytes / 4))?;
     let byte_count = rows.len() * (1 + row_bytes);
     let mut waiting = Vec::with_capacity(byte_count.min(AT_ONCE + row_bytes));
-    for y in rows {
+    for y in rows.clone() {
         row.clear();
         pixels.read_rows(y..y + 1, &mut row)?;
-        waiting.extend_from_slice(filter.filter(&above, &row, pixel_bytes));
+        waiting.extend_from_slice(if y == rows.start {
+            filter.filter_first(&row, pixel_bytes)
+        } else {
+            filter.filter(&above, &row, pixel_bytes)
+        });
         // A run of zeros ends with what is compressed at once.
         if waiting.len() >= AT_ONCE {
             compressor.write_data(&waiting)?;
@@ -137,10 +137,11 @@ fn join_adler32(first: u32, second: u32, second_byte_count: u64) -> u32 {
     const MODULUS: u64 = 65_521;
     let sums = |adler: u32| (u64::from(adler & 0xffff), u64::from(adler >> 16));
     let ((a1, b1), (a2, b2)) = (sums(first), sums(second));
-    // Each byte of the second part adds the first part's sum, which is not 1, to the other sum.
-    let before = a1 + MODULUS - 1;
-    let a = (before + a2) % MODULUS;
-    let b = (b1 + b2 + before % MODULUS * (second_byte_count % MODULUS)) % MODULUS;
+    // The second part's first sum began with 1 and should have begun with `a1`: each of its bytes
+    // adds so much more to the second sum.
+    let missing = a1 + MODULUS - 1;
+    let a = (missing + a2) % MODULUS;
+    let b = (b1 + b2 + missing % MODULUS * (second_byte_count % MODULUS)) % MODULUS;
     (b << 16 | a) as u32
 }
 
