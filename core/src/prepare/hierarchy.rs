@@ -17,6 +17,9 @@ use crate::{
 /// mesh no faster to trace and takes half as many bytes again.
 const FEW: usize = 4;
 
+/// So many corners are looked at in one go.
+const CORNERS_AT_ONCE: usize = 1 << 12;
+
 /// The hierarchy over all items of a scene: flat faces, spheres and solids.
 pub(super) struct Hierarchy {
     /// Boxes are kept in this frame.
@@ -45,7 +48,7 @@ fn frame_around(surfaces: &Surfaces) -> Frame {
     let flat = &surfaces.flat;
     let none = (DVec3::INFINITY, DVec3::NEG_INFINITY);
     let join = |a: (DVec3, DVec3), b: (DVec3, DVec3)| (a.0.min(b.0), a.1.max(b.1));
-    let corners = flat.corners[..flat.item_corner_count()].par_chunks(JOINED_AT_ONCE);
+    let corners = flat.corners[..flat.item_corner_count()].par_chunks(CORNERS_AT_ONCE);
     let bounds = corners.map(|corners| {
         corners.iter().fold(none, |(min, max), &corner| {
             let point = flat.points[corner as usize];
@@ -75,7 +78,7 @@ fn round_bounds(surfaces: &Surfaces) -> impl Iterator<Item = (DVec3, DVec3)> {
     })
 }
 
-/// A thread joins items among so many.
+/// Items are joined within runs of so many: the hierarchy depends on it.
 const JOINED_AT_ONCE: usize = 1 << 12;
 
 /// What the hierarchy is built over: flat faces, two at a time where they are as good as one, and

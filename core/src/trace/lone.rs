@@ -125,8 +125,8 @@ fn take_turns(
     }
 }
 
-/// A ray enters the child that comes next. When its way ends: whether its answer is known. It may be
-/// alone all the way.
+/// A ray enters the child that comes next. When its way ends: whether its answer is known.
+/// `IS_ALONE` is that of [`Traversal::enter`].
 #[inline(always)]
 pub(super) fn step<const IS_ALONE: bool>(
     kernel: impl BoxKernel,

@@ -15,8 +15,8 @@ pub(super) use self::primitive::BuildPrimitive;
 use self::split::{Scratch, Side, halve, split};
 use crate::prepared::node::{Child, Node};
 
-/// From this level on, splits are made in the middle, so that a path ends within 28 more.
-const MEDIAN_LEVEL: usize = 32;
+/// From this level on, ranges are halved as they stand, so that a path ends within 28 more.
+const HALVING_LEVEL: usize = 32;
 
 /// A range of no more primitives is built by one thread.
 const SERIAL: usize = 4096;
@@ -72,7 +72,7 @@ impl BuildRange {
     ) -> [Self; 2] {
         let own = &mut primitives[self.begin..self.end];
         let (at, sides) =
-            if level < MEDIAN_LEVEL { split(own, &self.side, scratch) } else { halve(own) };
+            if level < HALVING_LEVEL { split(own, &self.side, scratch) } else { halve(own) };
         let at = self.begin + at;
         let firsts = [self.first, self.first + sides[0].count];
         [
@@ -254,12 +254,13 @@ mod tests {
 
     const LEAVES: Leaves = Leaves { most: 4, alone_from: u32::MAX };
 
+    fn primitives_of(boxes: &[([f32; 3], [f32; 3])]) -> Vec<BuildPrimitive> {
+        let primitive = |(item, &(min, max))| BuildPrimitive::new(min, max, item);
+        (0..).zip(boxes).map(primitive).collect()
+    }
+
     fn check(boxes: &[([f32; 3], [f32; 3])]) -> Vec<Node> {
-        let mut primitives: Vec<BuildPrimitive> = boxes
-            .iter()
-            .enumerate()
-            .map(|(item, &(min, max))| BuildPrimitive::new(min, max, item as u32))
-            .collect();
+        let mut primitives = primitives_of(boxes);
         let nodes = build_bvh(&mut primitives, LEAVES);
         let mut seen = vec![0; boxes.len()];
         let mut levels = vec![1; nodes.len()];
@@ -304,6 +305,17 @@ mod tests {
     fn every_face_is_in_one_leaf_and_inside_its_boxes() {
         for count in [1, 2, 7, 8, 9, 100, 50_000] {
             check(&scattered(count));
+        }
+    }
+
+    #[test]
+    fn leaves_are_as_small_as_asked_and_costly_items_alone() {
+        let mut primitives = primitives_of(&scattered(5000));
+        let nodes = build_bvh(&mut primitives, Leaves { most: 4, alone_from: 4000 });
+        for leaf in nodes.iter().flat_map(|node| node.children).filter(|child| child.is_leaf()) {
+            let leaf = &primitives[leaf.items()];
+            let is_costly = leaf.iter().any(|primitive| primitive.item() >= 4000);
+            assert!(leaf.len() <= if is_costly { 1 } else { 4 });
         }
     }
 
@@ -422,10 +434,7 @@ mod tests {
     #[test]
     fn what_a_split_tells_of_its_sides_is_so() {
         let boxes = scattered(3000);
-        let primitives: Vec<BuildPrimitive> = (0..)
-            .zip(boxes)
-            .map(|(item, (min, max))| BuildPrimitive::new(min, max, item))
-            .collect();
+        let primitives = primitives_of(&boxes);
         for count in [2, 3, 5, 8, 9, 32, 33, 1000, 3000] {
             let mut primitives = primitives[..count].to_vec();
             let whole = Side::of(&primitives);
@@ -463,10 +472,7 @@ mod tests {
         let shrunk = |point: [f32; 3]| point.map(|x| x * 1e-6);
         let teapot = scattered(2000).into_iter().map(|(min, max)| (shrunk(min), shrunk(max)));
         boxes.extend(teapot);
-        let primitives: Vec<BuildPrimitive> = (0..)
-            .zip(boxes)
-            .map(|(item, (min, max))| BuildPrimitive::new(min, max, item))
-            .collect();
+        let primitives = primitives_of(&boxes);
         let cost_of = |splitter| {
             let mut primitives = primitives.clone();
             let side = Side::of(&primitives);
@@ -485,7 +491,10 @@ mod tests {
         let boxes = scattered(200_000);
         let build = |threads| {
             let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-            pool.install(|| check(&boxes))
+            let mut primitives = primitives_of(&boxes);
+            let nodes = pool.install(|| build_bvh(&mut primitives, LEAVES));
+            let order: Vec<u32> = primitives.iter().map(BuildPrimitive::item).collect();
+            (nodes, order)
         };
         let one = build(1);
         assert!(one == build(2) && one == build(5));

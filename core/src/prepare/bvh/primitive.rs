@@ -6,14 +6,15 @@ use glam::{Vec4, Vec4Swizzles};
 
 use crate::prepared::node::Child;
 
-const _: () = assert!(Child::ITEM_LIMIT <= NORMAL as usize);
+// Bit 29 stays clear: with all bits of the exponent set a float would be infinite or no number.
+const _: () = assert!(Child::ITEM_LIMIT <= NORMAL as usize / 2);
 
 /// Two items are joined where the box around them has less than this part of what their own boxes
 /// have of surface. It is half of it where these are the same, and 5/6 where two cubes touch.
 const JOINED: f32 = 0.95;
 
-/// With these bits a number that is kept in a float is no subnormal one, which would make
-/// arithmetic slow; it is below [`Child::ITEM_LIMIT`].
+/// Set in a number, below [`Child::ITEM_LIMIT`], that is kept in a float's bits: the float is a
+/// normal one then, and arithmetic on subnormal ones is slow.
 const NORMAL: u32 = 1 << 30;
 
 /// An axis-aligned box. The fourth numbers mean nothing: with them a corner is one load.

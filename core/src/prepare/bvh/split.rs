@@ -3,9 +3,8 @@
 //!
 //! Source: Wald, "On fast Construction of SAH-based Bounding Volume Hierarchies" (2007).
 
-use rayon::prelude::*;
-
 use glam::Vec4;
+use rayon::prelude::*;
 
 use super::{
     SERIAL,
@@ -15,10 +14,10 @@ use super::{
 const BINS: usize = 16;
 
 /// Ranges of up to this many primitives have half as many bins.
-const FEW: usize = 32;
+const MOST_IN_HALF_THE_BINS: usize = 32;
 
 /// Ranges of up to this many primitives are split where it is cheapest of all.
-const FEWEST: usize = 8;
+const MOST_SWEPT: usize = 8;
 
 /// One side of a split: a run of primitives.
 #[derive(Debug, Clone, Copy)]
@@ -62,10 +61,10 @@ pub(super) fn split(
     whole: &Side,
     scratch: &mut Scratch,
 ) -> (usize, [Side; 2]) {
-    if primitives.len() <= FEWEST {
-        return split_fewest(primitives);
+    if primitives.len() <= MOST_SWEPT {
+        return sweep_split(primitives);
     }
-    let found = if primitives.len() <= FEW {
+    let found = if primitives.len() <= MOST_IN_HALF_THE_BINS {
         BinnedSplit::cheapest::<{ BINS / 2 }>(primitives, whole)
     } else {
         BinnedSplit::cheapest::<BINS>(primitives, whole)
@@ -92,7 +91,7 @@ pub(super) fn halve(primitives: &[BuildPrimitive]) -> (usize, [Side; 2]) {
 #[inline(always)]
 fn centers_of(primitives: &[BuildPrimitive]) -> Bounds {
     let mut centers = Bounds::NONE;
-    if primitives.len() > FEWEST {
+    if primitives.len() > MOST_SWEPT {
         for primitive in primitives {
             centers.add(primitive.0.twice_center());
         }
@@ -102,30 +101,30 @@ fn centers_of(primitives: &[BuildPrimitive]) -> Bounds {
 
 /// The cheapest of all splits between neighbours in the order of their centres on an axis. The
 /// bounds of centres are left out: ranges of so few do without.
-fn split_fewest(primitives: &mut [BuildPrimitive]) -> (usize, [Side; 2]) {
-    let all: [BuildPrimitive; FEWEST] =
+fn sweep_split(primitives: &mut [BuildPrimitive]) -> (usize, [Side; 2]) {
+    let all: [BuildPrimitive; MOST_SWEPT] =
         std::array::from_fn(|k| primitives[k.min(primitives.len() - 1)]);
     let count = primitives.len();
     let mut best = (f32::INFINITY, 1, std::array::from_fn(|k| k));
     if count > 2 {
-        let mut keys = [[0.0; FEWEST]; 3];
+        let mut keys = [[0.0; MOST_SWEPT]; 3];
         for (k, primitive) in all.iter().enumerate() {
             let [x, y, z, _] = primitive.0.twice_center().to_array();
             (keys[0][k], keys[1][k], keys[2][k]) = (x, y, z);
         }
         for keys in &keys {
             let order = order_of(keys, count);
-            let mut right_cost = [0.0; FEWEST];
+            let mut right_cost = [0.0; MOST_SWEPT];
             let (mut side, mut items) = (Bounds::NONE, 0);
             for k in (1..count).rev() {
-                let primitive = &all[order[k] % FEWEST];
+                let primitive = &all[order[k] % MOST_SWEPT];
                 side = side.join(&primitive.0);
                 items += primitive.count();
                 right_cost[k] = side.half_area() * items as f32;
             }
             (side, items) = (Bounds::NONE, 0);
             for k in 1..count {
-                let primitive = &all[order[k - 1] % FEWEST];
+                let primitive = &all[order[k - 1] % MOST_SWEPT];
                 side = side.join(&primitive.0);
                 items += primitive.count();
                 let cost = side.half_area() * items as f32 + right_cost[k];
@@ -138,7 +137,7 @@ fn split_fewest(primitives: &mut [BuildPrimitive]) -> (usize, [Side; 2]) {
     let (_, at, order) = best;
     let mut sides = [Side { count: 0, bounds: Bounds::NONE, centers: Bounds::NONE }; 2];
     for (k, primitive) in primitives.iter_mut().enumerate() {
-        *primitive = all[order[k] % FEWEST];
+        *primitive = all[order[k] % MOST_SWEPT];
         let side = &mut sides[usize::from(k >= at)];
         side.bounds = side.bounds.join(&primitive.0);
         side.count += primitive.count() as usize;
@@ -148,17 +147,17 @@ fn split_fewest(primitives: &mut [BuildPrimitive]) -> (usize, [Side; 2]) {
 
 /// The first `count` numbers in the order of their keys, equal ones in their own.
 #[inline(always)]
-fn order_of(keys: &[f32; FEWEST], count: usize) -> [usize; FEWEST] {
-    let mut ranks = [0_u32; FEWEST];
+fn order_of(keys: &[f32; MOST_SWEPT], count: usize) -> [usize; MOST_SWEPT] {
+    let mut ranks = [0_u32; MOST_SWEPT];
     for (k, key) in keys.iter().enumerate().take(count) {
         for (other, rank) in ranks.iter_mut().enumerate() {
             let is_before = if k < other { *key <= keys[other] } else { *key < keys[other] };
             *rank += u32::from(is_before);
         }
     }
-    let mut order = [0; FEWEST];
+    let mut order = [0; MOST_SWEPT];
     for (k, rank) in ranks.into_iter().enumerate().take(count) {
-        order[rank as usize % FEWEST] = k;
+        order[rank as usize % MOST_SWEPT] = k;
     }
     order
 }
@@ -189,7 +188,9 @@ struct BinnedSplit {
     binning: Binning,
 }
 
-/// Up to the next power of two the bits of a number from here on count in ones.
+/// From here to 2^24 neighbouring floats are 1 apart: a small number that is added is rounded to an
+/// integer, ties to even ones, which is in the low bits then. [`Binning::bins`] and
+/// [`Binning::bin`] round alike.
 const ONES: f32 = (3 << 22) as f32;
 
 impl Binning {
@@ -219,13 +220,14 @@ impl Binning {
                 bins.counts[axis][bin % COUNT] += primitive.count();
             }
         };
-        // Neighbours share a bin, which would have to wait for the one before.
-        let (near, far) = primitives.split_at(primitives.len() / 2);
-        for (near, far) in near.iter().zip(far) {
-            add(near);
-            add(far);
+        // Neighbours often share a bin, and an update waits for the one before it: they are taken
+        // from both halves by turns.
+        let (first_half, second_half) = primitives.split_at(primitives.len() / 2);
+        for (one, other) in first_half.iter().zip(second_half) {
+            add(one);
+            add(other);
         }
-        far[near.len()..].iter().for_each(add);
+        second_half[first_half.len()..].iter().for_each(add);
         bins
     }
 }
