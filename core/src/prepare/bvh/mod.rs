@@ -12,14 +12,11 @@ mod split;
 use rayon::prelude::*;
 
 pub(super) use self::primitive::BuildPrimitive;
-use self::split::{Scratch, Side, halve, split};
+use self::split::{SERIAL, Scratch, Side, halve, split};
 use crate::prepared::node::{Child, Node};
 
 /// From this level on, ranges are halved as they stand, so that a path ends within 28 more.
 const HALVING_LEVEL: usize = 32;
-
-/// A range of no more primitives is built by one thread.
-const SERIAL: usize = 4096;
 
 /// Which ranges are leaves.
 #[derive(Debug, Clone, Copy)]

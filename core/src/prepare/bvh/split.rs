@@ -6,10 +6,10 @@
 use glam::Vec4;
 use rayon::prelude::*;
 
-use super::{
-    SERIAL,
-    primitive::{Bounds, BuildPrimitive},
-};
+use super::primitive::{Bounds, BuildPrimitive};
+
+/// A range of no more primitives is built by one thread.
+pub(super) const SERIAL: usize = 4096;
 
 const BINS: usize = 16;
 
