@@ -3,6 +3,8 @@
 //!
 //! Source: Wald, "On fast Construction of SAH-based Bounding Volume Hierarchies" (2007).
 
+use std::ops::Range;
+
 use glam::Vec4;
 use rayon::prelude::*;
 
@@ -244,7 +246,7 @@ impl<const COUNT: usize> Bins<COUNT> {
     }
 
     /// The bounds and the number of items in some bins of an axis.
-    fn side(&self, axis: usize, bins: std::ops::Range<usize>) -> Side {
+    fn side(&self, axis: usize, bins: Range<usize>) -> Side {
         let (bounds, counts) = (&self.bounds[axis][bins.clone()], &self.counts[axis][bins]);
         Side {
             count: counts.iter().sum::<u32>() as usize,

@@ -212,6 +212,17 @@ fn random_ray(random: &mut Random, solid: &Solid, style: Style) -> (DVec3, DVec3
     (target - back * direction, direction)
 }
 
+/// A ray without an end, in the units of the prepared scene, that leaves no surface.
+fn endless_ray(view: &View<'_>, (origin, direction): (DVec3, DVec3)) -> Ray {
+    Ray {
+        origin: origin * view.header.scale,
+        direction,
+        reach: f64::INFINITY,
+        leaving: Surface::NONE,
+        after: Ray::NOTHING_AHEAD,
+    }
+}
+
 /// What a ray is told of, with the kernel of an instruction set.
 struct Told<'a> {
     solid: &'a SolidRecord,
@@ -278,14 +289,8 @@ fn check_solid(
             crossed += truth.len();
             truth
         };
-        let (origin, direction) = random_ray(random, solid, style);
-        let ray = Ray {
-            origin: origin * view.header.scale,
-            direction,
-            reach: f64::INFINITY,
-            leaving: Surface::NONE,
-            after: Ray::NOTHING_AHEAD,
-        };
+        let ray = endless_ray(&view, random_ray(random, solid, style));
+        let direction = ray.direction;
         let truth = check(&ray, &[]);
         let Some(&Crossing { t, part }) = truth.get(random.below(truth.len().max(1))) else {
             continue;
@@ -483,14 +488,8 @@ fn rays_of_a_group_are_told_what_each_is_told_alone() {
             }
         };
         for _ in 0..40 {
-            let (origin, direction) = random_ray(random, &solid, style);
-            let ray = Ray {
-                origin: origin * view.header.scale,
-                direction,
-                reach: f64::INFINITY,
-                leaving: Surface::NONE,
-                after: Ray::NOTHING_AHEAD,
-            };
+            let ray = endless_ray(&view, random_ray(random, &solid, style));
+            let direction = ray.direction;
             class(ray);
             let truth = plain_crossings(&Course::new(&view, record, &ray, &[]), f64::INFINITY);
             let Some(&Crossing { t, part }) = truth.get(random.below(truth.len().max(1))) else {
